@@ -1,0 +1,116 @@
+"""Small sets of shapes for examples and tests, aligned and of unit size."""
+
+import csv
+import importlib.util
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .io import read_csv
+from .shapes import procrustes_align, resample
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """Shapes in register: aligned on their mean, each of unit RMS radius, centred.
+
+    - `points`: (N, num_points, 2).
+    - `mean`: (num_points, 2), their Procrustes mean, of unit RMS radius too.
+    - `labels`: the group of each shape, such as its genus.
+    - `names`: a name for each shape.
+    """
+
+    points: NDArray
+    mean: NDArray
+    labels: tuple[str, ...]
+    names: tuple[str, ...]
+
+
+def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
+    """Outlines of mosquito wings (Rohlf & Archie 1984), from the package `ktch`.
+
+    126 specimens: 57 of genus `"AE"`, 25 of `"CX"`, 12 of `"PS"`, 11 of `"AN"`, 7 of `"CA"`, 4 of `"UR"`, 4
+    of `"WY"`, 3 of `"MA"`, 1 each of `"DE"`, `"OR"`, `"TO"` (the source's codes: *Aedes*, *Culex*, ...).
+
+    The source gives 100 points of each outline at equal polar angles, which crowds them in the middle of a
+    long wing; here they are at equal arc length. The first point of every outline is the corner at the wing's
+    hinge; they run counter-clockwise. Shapes are aligned within the selection by rotations, so the same wing
+    is turned a little differently in another selection. The long axis of the mean lies on the x-axis, the
+    hinge at positive x.
+
+    **Arguments:**
+
+    - `num_points`: of each outline, at least 3. More than about 100 only interpolate the source.
+    - `genus`: a code from above; all genera without it.
+
+    **Returns:** `Shapes`; labels are genera, names such as `"CX 103"` hold the source's number.
+
+    **Raises:** `ImportError` without `ktch`, `ValueError` for a genus that is not there.
+    """
+    if num_points < 3:
+        raise ValueError(f"`num_points` must be at least 3 for an outline, got {num_points}.")
+    folder = _ktch_data() / "outline_mosquito_wings"
+    with open(folder / "meta_outline_mosquito_wings.csv", encoding="utf-8", newline="") as file:
+        genera = {row["specimen_id"]: row["genus"] for row in csv.DictReader(file)}
+    outlines = read_csv(folder / "data_outline_mosquito_wings.csv", id="specimen_id", point="coord_id")
+    chosen = {wing.id: wing.landmarks for wing in outlines if genus in (None, genera[str(wing.id)])}
+    if not chosen:
+        available = ", ".join(f"{name!r} ({count})" for name, count in Counter(genera.values()).most_common())
+        raise ValueError(f"`genus` must be one of {available}, or None for all; got {genus!r}.")
+    labels = tuple(genera[name] for name in chosen)
+    names = tuple(f"{label} {name}" for label, name in zip(labels, chosen, strict=True))
+    wings = _in_register([resample(outline, num_points) for outline in chosen.values()], labels, names)
+    return _along_x(wings)
+
+
+def ellipses(num_points: int = 32, aspects: Sequence[float] = (1.0, 1.25, 1.5, 2.0)) -> Shapes:
+    """Ellipses with the given ratios of their axes: the smallest set to try a model on, without a download.
+
+    Points are at equal arc length, counter-clockwise from the end of the long axis at positive x (for a ratio
+    below 1, the short one). Labels are the ratios.
+
+    **Arguments:**
+
+    - `num_points`: of each outline, at least 3.
+    - `aspects`: positive ratios of the x-axis to the y-axis.
+
+    **Returns:** `Shapes`.
+    """
+    if num_points < 3:
+        raise ValueError(f"`num_points` must be at least 3 for an outline, got {num_points}.")
+    if len(aspects) == 0 or min(aspects) <= 0.0:
+        raise ValueError(f"`aspects` must be one or more positive ratios, got {tuple(aspects)}.")
+    angles = np.linspace(0.0, 2.0 * np.pi, 100 * num_points, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    labels = tuple(f"{aspect:g}" for aspect in aspects)
+    points = [resample(circle * [aspect, 1.0], num_points) for aspect in aspects]
+    return _in_register(points, labels, tuple(f"ellipse {label}" for label in labels))
+
+
+def _in_register(points: Sequence[NDArray], labels: tuple[str, ...], names: tuple[str, ...]) -> Shapes:
+    alignment = procrustes_align(np.stack(points))
+    return Shapes(alignment.shapes, alignment.mean, labels, names)
+
+
+def _along_x(shapes: Shapes) -> Shapes:
+    """Turned so that the long axis of the mean is the x-axis and its first point lies at positive x."""
+    _, _, axes = np.linalg.svd(shapes.mean)
+    axes[0] *= np.sign(shapes.mean[0] @ axes[0])
+    turn = np.stack([axes[0], [-axes[0, 1], axes[0, 0]]], axis=1)
+    return replace(shapes, points=shapes.points @ turn, mean=shapes.mean @ turn)
+
+
+def _ktch_data() -> Path:
+    """The folder of data inside `ktch`, found without importing it, which takes seconds."""
+    spec = importlib.util.find_spec("ktch")
+    folders = spec.submodule_search_locations if spec is not None else None
+    if not folders:
+        raise ImportError(
+            "The outlines are in the package `ktch`, which is not installed: "
+            "pip install 'numpyro_bridges[examples]'"
+        )
+    return Path(folders[0]) / "datasets" / "data"
