@@ -1,0 +1,11 @@
+"""Drawings of shapes, bridges, scores and posteriors with matplotlib.
+
+Every function draws on the axes it is given, or makes its own, and returns what it drew. Shapes are (n, 2).
+The colours can be told apart by colour-blind readers (after Okabe & Ito); time runs from dark to light.
+"""
+
+from ._posterior import posterior as posterior
+from ._shapes import bridge_fan as bridge_fan
+from ._shapes import outlines as outlines
+from ._shapes import path as path
+from ._shapes import score_field as score_field
