@@ -1,0 +1,145 @@
+"""Arithmetic on the log weights of importance samples.
+
+Every function takes an array of log weights whose last axis runs over the particles, and reduces that axis.
+A weight of zero (`-inf`) is a weight like any other; a NaN weight is a failure of whatever computed it and
+makes the result NaN, so that it is never mistaken for a weight of zero. An infinite weight is such a failure too.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def log_mean_exp(log_weights: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
+    """Log of the mean weight, the estimate of a log evidence: log (1/S) Σ exp(log_weights).
+
+    **Arguments:**
+
+    - `log_weights`: log weights of any magnitude.
+    - `axis`: the axis of the S particles.
+
+    **Returns:** the array without `axis`; `-inf` where every weight is zero.
+    """
+    log_weights = jnp.asarray(log_weights)
+    return jax.nn.logsumexp(log_weights, axis=axis) - math.log(log_weights.shape[axis])
+
+
+def effective_sample_size(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
+    """How many equally weighted particles the weights are worth (Kish): (Σ w)² / Σ w².
+
+    **Arguments:**
+
+    - `log_weights`: log weights, particles along the last axis.
+
+    **Returns:** a number between 1 and S, in particles; 0 where every weight is zero.
+    """
+    weights = _relative(log_weights)
+    squares = jnp.sum(weights**2, axis=-1)
+    return jnp.where(squares == 0, 0.0, jnp.sum(weights, axis=-1) ** 2 / jnp.where(squares == 0, 1.0, squares))
+
+
+def standard_error(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
+    """Standard error of `log_mean_exp`, by the delta method: sd(w) / (mean(w) √S).
+
+    It is itself estimated from the weights, and far too small where `pareto_k` exceeds `pareto_k_threshold`.
+
+    **Arguments:**
+
+    - `log_weights`: log weights, particles along the last axis.
+
+    **Returns:** the standard error in nats; `inf` where every weight is zero, NaN for a single particle.
+    """
+    weights = _relative(log_weights)
+    num_particles = weights.shape[-1]
+    mean = jnp.mean(weights, axis=-1, keepdims=True)
+    deviation = jnp.sqrt(jnp.sum((weights - mean) ** 2, axis=-1) / (num_particles - 1.0))
+    mean = mean[..., 0]
+    ratio = deviation / (jnp.where(mean == 0, 1.0, mean) * math.sqrt(num_particles))
+    return jnp.where(mean == 0, jnp.inf, ratio)
+
+
+@jax.jit
+def pareto_k(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
+    """Shape k̂ of the generalised Pareto distribution fitted to the largest weights.
+
+    Moments of the weights of order 1/k and more are infinite: from k = 1/2 on the weights have no variance, from
+    k = 1 on no mean. The estimate of their mean is reliable up to `pareto_k_threshold`.
+
+    The tail is the ⌈min(S/5, 3 √S)⌉ largest weights, as exceedances over the next smaller one; its shape is the
+    estimate of Zhang and Stephens with a prior of weight 10 at 1/2, as in Vehtari et al., section 2.4 and
+    appendix C. Everything is kept in logarithms, so that weights which differ by hundreds of nats
+    still have a shape (a large one).
+
+    **Arguments:**
+
+    - `log_weights`: log weights, particles along the last axis.
+
+    **Returns:** k̂. `-inf` where the largest weights are all equal: they are bounded, and harmless. `inf` where a
+    shape cannot be fitted, with fewer than five weights above the cutoff: fewer than 21 particles, or nearly all
+    weights zero.
+
+    **Source:** [@vehtari2024], [@zhang2009].
+    """
+    return jnp.vectorize(_pareto_k, signature="(s)->()")(jnp.asarray(log_weights))
+
+
+def pareto_k_threshold(num_particles: int) -> float:
+    """The k̂ above which an estimate from so many particles is not to be relied on: min(1 − 1/log₁₀ S, 0.7).
+
+    **Source:** [@vehtari2024], equation 13.
+    """
+    if num_particles < 2:
+        raise ValueError(f"`num_particles` must be at least 2, got {num_particles}.")
+    return min(1 - 1 / math.log10(num_particles), 0.7)
+
+
+def _relative(log_weights):
+    """Weights relative to the largest; zero, not NaN, where all are zero."""
+    log_weights = jnp.asarray(log_weights)
+    largest = jnp.max(log_weights, axis=-1, keepdims=True)
+    return jnp.exp(log_weights - jnp.where(largest == -jnp.inf, 0.0, largest))
+
+
+def _pareto_k(log_weights):
+    num_particles = log_weights.shape[0]
+    num_tail = math.ceil(min(num_particles / 5, 3 * math.sqrt(num_particles)))
+    ordered = jnp.sort(log_weights)
+    tail = ordered[num_particles - num_tail :]
+    cutoff = ordered[max(num_particles - num_tail - 1, 0)]
+
+    exceeds = tail > cutoff
+    num_exceed = jnp.sum(exceeds)
+    n = num_exceed.astype(log_weights.dtype)
+    # log of the exceedances y = exp(tail) − exp(cutoff), ascending; the ties with the cutoff come first
+    log_y = tail + jnp.log1p(-jnp.exp(jnp.where(exceeds, cutoff - tail, -1.0)))
+    log_y_max = log_y[-1]
+    quartile = num_tail - num_exceed + jnp.maximum((num_exceed + 2) // 4 - 1, 0)
+    log_y_quartile = log_y[jnp.minimum(quartile, num_tail - 1)]
+
+    # The rate b = 1/max(y) − a/quartile(y), in units of 1/quartile(y), and the mean of log(1 − b y): the second form
+    # never overflows, the first stays proportional to b as b → 0.
+    def rate(log_a):
+        return jnp.exp(log_y_quartile - log_y_max) - jnp.exp(log_a)
+
+    def mean_log(log_a):
+        step = rate(log_a) * jnp.exp(log_y - log_y_quartile)
+        large = jnp.logaddexp(log_a + log_y - log_y_quartile, jnp.log(-jnp.expm1(log_y - log_y_max)))
+        terms = jnp.where(jnp.abs(step) < 0.5, jnp.log1p(-step), large)
+        return jnp.sum(jnp.where(exceeds, terms, 0.0)) / n
+
+    grid_size = 30 + math.isqrt(num_tail)
+    grid = jnp.arange(1, grid_size + 1, dtype=log_weights.dtype) - 0.5
+    log_a = jnp.log((jnp.sqrt(grid_size / grid) - 1) / 3)
+    k = jax.vmap(mean_log)(log_a)
+    log_likelihood = n * (jnp.log(jnp.abs(rate(log_a) / k)) - k)
+    # a grid point at b = 0, where the likelihood is 0/0, is left to its neighbours
+    log_likelihood = jnp.where(jnp.isfinite(log_likelihood), log_likelihood, -jnp.inf)
+    fitted = mean_log(jax.nn.logsumexp(log_a + jax.nn.log_softmax(log_likelihood)))
+    fitted = (n * fitted + 5.0) / (n + 10.0)
+
+    ties = tail if num_tail >= 5 else ordered
+    bounded = (ties[0] == ties[-1]) & (ties[0] > -jnp.inf)
+    fitted = jnp.where(bounded, -jnp.inf, jnp.where(n < 5, jnp.inf, fitted))
+    return jnp.where(jnp.any(jnp.isnan(log_weights)) | (ordered[-1] == jnp.inf), jnp.nan, fitted)

@@ -1,0 +1,59 @@
+"""Strict settings for everything below the NumPyro layers, and the fixtures that the tests share."""
+
+import os
+import secrets
+from pathlib import Path
+
+# Before JAX is imported: threads cost more than they give on the small matrices of the tests.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax
+import jax.random as jr
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+
+# NumPyro promotes dtypes and ranks freely. Tests that run it are named like this, or carry
+# `pytestmark = pytest.mark.numpyro`.
+NUMPYRO = ("test_distributions", "test_infer", "test_examples", "test_readme")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--slow", action="store_true", help="run the tests marked slow, which take minutes")
+    parser.addoption("--seed", type=int, help="seed of the `key` fixture; drawn anew for each test by default")
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("--slow"):
+        skip = pytest.mark.skip(reason="slow: run with --slow")
+        for item in items:
+            if item.get_closest_marker("slow"):
+                item.add_marker(skip)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _promotion(request):
+    """Of module scope, so that fixtures of a module run under the settings of its tests."""
+    numpyro = request.path.name.startswith(NUMPYRO) or request.node.get_closest_marker("numpyro")
+    dtypes, ranks = ("standard", "allow") if numpyro else ("strict", "raise")
+    with jax.numpy_dtype_promotion(dtypes), jax.numpy_rank_promotion(ranks):
+        yield
+
+
+@pytest.fixture
+def key(request):
+    """A random key, for identities that hold for every key. A failure shows its seed."""
+    seed = request.config.getoption("--seed")
+    seed = secrets.randbits(31) if seed is None else seed
+    print(f"key of seed {seed}: repeat with --seed {seed}")
+    return jr.key(seed)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real data sets, which are not part of the package."""
+    default = Path(__file__).parents[2] / "shared" / "data"
+    path = Path(os.environ.get("NUMPYRO_BRIDGES_DATA", default))
+    if not path.is_dir():
+        pytest.skip(f"no data at {path}: set NUMPYRO_BRIDGES_DATA")
+    return path
