@@ -1,0 +1,129 @@
+"""What a space is: a finite set of functions on the circle, and the norm in which curves are compared.
+
+A closed curve s ↦ x(s) in R^dim, s in [0, 2π), is held as a state of n rows x_i in R^dim,
+
+    x(s) = Σ_i φ_i(s) x_i,    ‖x‖² = Σ_i w_i |x_i|² ≈ ∫ |x(s)|² ds / 2π      (the H-norm).
+"""
+
+from abc import abstractmethod
+from operator import index
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .._checks import as_float, require
+
+
+class AbstractSpace(eqx.Module):
+    """Closed curves in R^dim, discretised. Everything is written for one state, (size, dim)."""
+
+    dim: eqx.AbstractVar[int]
+    weights: eqx.AbstractVar[Float[Array, " n"]]
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Number n of rows of a state."""
+
+    @property
+    @abstractmethod
+    def grid(self) -> np.ndarray:
+        """The q parameters s at which fields along the curve are evaluated, equispaced."""
+
+    @abstractmethod
+    def basis(self, s: ArrayLike) -> Float[Array, "m n"]:
+        """The values φ_i(s_j), one column for each function."""
+
+    @abstractmethod
+    def to_points(self, x: Float[Array, "n dim"]) -> Float[Array, "q dim"]:
+        """The points of the curve at the parameters `grid`."""
+
+    @abstractmethod
+    def from_points(self, values: Float[Array, "q ..."]) -> Float[Array, "n ..."]:
+        """The coefficients of a field from its values at the points; trailing axes are kept."""
+
+    def inner(self, x: Float[Array, "n dim"], y: Float[Array, "n dim"]) -> Float[Array, ""]:
+        """⟨x, y⟩ = Σ_i w_i x_i · y_i."""
+        x, y = self._state(x), self._state(y)
+        require(
+            jnp.ndim(self.weights) == 1,
+            f"`weights` must be of shape ({self.size},); got {jnp.shape(self.weights)}. For a batch of "
+            "spaces, `jax.vmap` the function that uses them.",
+        )
+        return jnp.sum(self.weights.astype(x.dtype)[:, None] * x * y)
+
+    def squared_norm(self, x: Float[Array, "n dim"]) -> Float[Array, ""]:
+        """‖x‖², smooth everywhere."""
+        return self.inner(x, x)
+
+    def norm(self, x: Float[Array, "n dim"]) -> Float[Array, ""]:
+        """‖x‖. Its gradient at x = 0 is NaN: differentiate `squared_norm` where x may vanish."""
+        return jnp.sqrt(self.squared_norm(x))
+
+    def evaluate(self, x: Float[Array, "n dim"], s: ArrayLike) -> Float[Array, "m dim"]:
+        """The points x(s_j) of the curve."""
+        x = self._state(x)
+        return jnp.matmul(self.basis(s).astype(x.dtype), x, precision="highest")
+
+    def project(self, values: Float[Array, "m dim"], s: ArrayLike | None = None) -> Float[Array, "n dim"]:
+        """The curve of this space that is nearest to given points, by least squares.
+
+        **Arguments:**
+
+        - `values`: points of a curve, (m, dim), at least as many as a state has rows. (The curve through
+            fewer landmarks is `refine` from their own space.)
+        - `s`: their parameters in [0, 2π), (m,); equispaced from 0 on if left out.
+
+        **Returns:** the state; where the points leave it open (repeated parameters), the one of least norm.
+        """
+        values = as_float(values, "values")
+        require(
+            values.ndim == 2 and values.shape[1] == self.dim and values.shape[0] >= self.size,
+            f"`values` must be at least {self.size} points of dimension {self.dim}, one a row; got shape "
+            f"{values.shape}. Fewer points become a curve by `refine` from `Landmarks` of their number; "
+            "for a batch, use `jax.vmap`.",
+        )
+        s = equispaced(values.shape[0]) if s is None else s
+        require(
+            jnp.shape(s) == values.shape[:1],
+            f"`s` must have one parameter for each of {values.shape[0]} points; got shape {jnp.shape(s)}.",
+        )
+        return jnp.linalg.lstsq(self.basis(s).astype(values.dtype), values)[0]
+
+    def refine(self, x: Float[Array, "n dim"], finer: "AbstractSpace") -> Float[Array, "m dim"]:
+        """The same curve as a state of another space that is at least as fine, of either kind.
+
+        A coarser space gets what its `from_points` makes of the curve: its points, or projected coefficients.
+        """
+        require(
+            finer.dim == self.dim,
+            f"`finer` must hold curves in R^{self.dim}; got a space of dimension {finer.dim}.",
+        )
+        return finer.from_points(self.evaluate(x, finer.grid))
+
+    def _state(self, x: ArrayLike) -> Float[Array, "n dim"]:
+        """A state, or `ValueError`: one row too few would broadcast."""
+        x = as_float(x, "x")
+        require(
+            x.shape == (self.size, self.dim),
+            f"a state of this space must have shape ({self.size}, {self.dim}); got {x.shape}. For a batch, "
+            "use `jax.vmap`.",
+        )
+        return x
+
+
+def equispaced(n: int) -> np.ndarray:
+    """n parameters 2π i / n."""
+    return 2 * np.pi * np.arange(n) / n
+
+
+def positive_integer(value: int, name: str) -> int:
+    """A static size."""
+    try:
+        size = index(value)
+    except TypeError:
+        size = 0
+    require(size > 0, f"`{name}` must be a positive integer, known before tracing; got {value!r}.")
+    return size
