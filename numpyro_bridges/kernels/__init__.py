@@ -1,0 +1,14 @@
+"""Kernels: positive definite functions on R^dim with the closed forms that stochastic flows need."""
+
+from ._base import (
+    AbstractKernel as AbstractKernel,
+)
+from ._base import (
+    AbstractRadialKernel as AbstractRadialKernel,
+)
+from ._base import (
+    KernelCombination as KernelCombination,
+)
+from ._gaussian import GaussianKernel as GaussianKernel
+from ._matern import MaternKernel as MaternKernel
+from ._quadrature import QuadratureCovariance as QuadratureCovariance

@@ -1,0 +1,64 @@
+"""Parameters and points of kernels: what is checked when they come in, and again when they are used."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .._checks import as_float, require, require_positive
+
+
+def scalar(value: Array, name: str, dtype: jnp.dtype) -> Float[Array, ""]:
+    """A parameter at the moment of its use, in the precision of the points.
+
+    `jax.vmap` of a constructor returns a module whose parameters have a leading axis. Used without `vmap`, it
+    would broadcast against the rows of a matrix and give a wrong number, so any axis is refused.
+    """
+    require(
+        jnp.ndim(value) == 0,
+        f"`{name}` must be a scalar; got an array of shape {jnp.shape(value)}. For a batch of kernels, "
+        "`jax.vmap` the constructor, and with it the function that uses the kernel.",
+    )
+    return value.astype(dtype)
+
+
+def positive_scalar(name: str) -> Callable[[ArrayLike], Float[Array, ""]]:
+    """A field converter: a positive, finite scalar of a floating dtype. Traced values pass."""
+
+    def convert(value: ArrayLike) -> Float[Array, ""]:
+        value = as_float(value, name)
+        value = scalar(value, name, value.dtype)
+        require_positive(value, name, "A prior on the positive half-line (`dist.LogNormal`) keeps it there.")
+        return value
+
+    return convert
+
+
+def points(x: ArrayLike, name: str) -> Float[Array, "n dim"]:
+    """Points as an array of a floating dtype, one a row."""
+    x = as_float(x, name)
+    require(
+        x.ndim == 2,
+        f"`{name}` must hold one point a row, (n, dim); got shape {x.shape}. For a batch, use `jax.vmap`.",
+    )
+    return x
+
+
+def squared_distances(x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:
+    """|x_i - y_j|² from differences: exactly 0 at coincident points, symmetric where x is y, smooth."""
+    x, y = points(x, "x"), points(y, "y")
+    require(
+        x.shape[1] == y.shape[1],
+        f"`x` and `y` must hold points of one dimension; got shapes {x.shape} and {y.shape}.",
+    )
+    return jnp.sum(jnp.square(x[:, None, :] - y[None, :, :]), axis=-1)
+
+
+def squared_frequency(omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
+    """|ω|² of frequency vectors, the last axis being that of space."""
+    omega = as_float(omega, "omega")
+    require(
+        omega.ndim > 0 and omega.shape[-1] == dim,
+        f"`omega` must hold frequency vectors of R^{dim}, (..., {dim}); got shape {jnp.shape(omega)}.",
+    )
+    return jnp.sum(jnp.square(omega), axis=-1)
