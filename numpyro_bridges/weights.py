@@ -1,8 +1,9 @@
 """Arithmetic on the log weights of importance samples.
 
 Every function takes an array of log weights whose last axis runs over the particles, and reduces that axis.
-A weight of zero (`-inf`) is a weight like any other; a NaN weight is a failure of whatever computed it and
-makes the result NaN, so that it is never mistaken for a weight of zero. An infinite weight is such a failure too.
+A weight of zero (`-inf`) is a weight like any other. A NaN weight is a failure of whatever computed it and
+makes the result NaN, so that it is never mistaken for a weight of zero; an infinite weight does the same,
+except to the mean, which it makes infinite.
 """
 
 import math
@@ -37,7 +38,7 @@ def effective_sample_size(log_weights: Float[Array, "... S"]) -> Float[Array, ".
     """
     weights = _relative(log_weights)
     squares = jnp.sum(weights**2, axis=-1)
-    return jnp.where(squares == 0, 0.0, jnp.sum(weights, axis=-1) ** 2 / jnp.where(squares == 0, 1.0, squares))
+    return jnp.sum(weights, axis=-1) ** 2 / jnp.where(squares == 0, 1.0, squares)
 
 
 def standard_error(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
@@ -64,21 +65,20 @@ def standard_error(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
 def pareto_k(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
     """Shape k̂ of the generalised Pareto distribution fitted to the largest weights.
 
-    Moments of the weights of order 1/k and more are infinite: from k = 1/2 on the weights have no variance, from
-    k = 1 on no mean. The estimate of their mean is reliable up to `pareto_k_threshold`.
+    Moments of order 1/k and more are infinite: from k = 1/2 on the weights have no variance, from k = 1 on no
+    mean. The estimate of their mean is reliable up to `pareto_k_threshold`.
 
-    The tail is the ⌈min(S/5, 3 √S)⌉ largest weights, as exceedances over the next smaller one; its shape is the
-    estimate of Zhang and Stephens with a prior of weight 10 at 1/2, as in Vehtari et al., section 2.4 and
-    appendix C. Everything is kept in logarithms, so that weights which differ by hundreds of nats
-    still have a shape (a large one).
+    The tail is the ⌈min(S/5, 3 √S)⌉ largest weights, as exceedances over the next smaller one; its shape is
+    the estimate of Zhang and Stephens, shrunk towards 1/2 as by ten further weights. All is kept in
+    logarithms, so weights that differ by hundreds of nats still have a shape (a large one).
 
     **Arguments:**
 
     - `log_weights`: log weights, particles along the last axis.
 
-    **Returns:** k̂. `-inf` where the largest weights are all equal: they are bounded, and harmless. `inf` where a
-    shape cannot be fitted, with fewer than five weights above the cutoff: fewer than 21 particles, or nearly all
-    weights zero.
+    **Returns:** k̂. `-inf` where the largest weights are all equal: they are bounded, and harmless. `inf`
+    where no shape can be fitted, with fewer than five weights above the cutoff: below 21 particles, or with
+    nearly all weights zero.
 
     **Source:** [@vehtari2024], [@zhang2009].
     """
@@ -118,15 +118,15 @@ def _pareto_k(log_weights):
     quartile = num_tail - num_exceed + jnp.maximum((num_exceed + 2) // 4 - 1, 0)
     log_y_quartile = log_y[jnp.minimum(quartile, num_tail - 1)]
 
-    # The rate b = 1/max(y) − a/quartile(y), in units of 1/quartile(y), and the mean of log(1 − b y): the second form
-    # never overflows, the first stays proportional to b as b → 0.
+    # The rate b = 1/max(y) − a/quartile(y), in units of 1/quartile(y), and the mean of log(1 − b y), in a
+    # form that never overflows and, as b → 0, in one that stays proportional to b.
     def rate(log_a):
         return jnp.exp(log_y_quartile - log_y_max) - jnp.exp(log_a)
 
     def mean_log(log_a):
         step = rate(log_a) * jnp.exp(log_y - log_y_quartile)
-        large = jnp.logaddexp(log_a + log_y - log_y_quartile, jnp.log(-jnp.expm1(log_y - log_y_max)))
-        terms = jnp.where(jnp.abs(step) < 0.5, jnp.log1p(-step), large)
+        stable = jnp.logaddexp(log_a + log_y - log_y_quartile, jnp.log(-jnp.expm1(log_y - log_y_max)))
+        terms = jnp.where(jnp.abs(step) < 0.5, jnp.log1p(-step), stable)
         return jnp.sum(jnp.where(exceeds, terms, 0.0)) / n
 
     grid_size = 30 + math.isqrt(num_tail)

@@ -20,7 +20,7 @@ NUMPYRO = ("test_distributions", "test_infer", "test_examples", "test_readme")
 
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, which take minutes")
-    parser.addoption("--seed", type=int, help="seed of the `key` fixture; drawn anew for each test by default")
+    parser.addoption("--seed", type=int, help="seed of the `key` fixture; by default a new one for each test")
 
 
 def pytest_collection_modifyitems(config, items):

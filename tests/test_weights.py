@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+
 from numpyro_bridges import weights
 
 SHIFTS = [0.0, 1e4, -1e4]
