@@ -35,6 +35,11 @@ def posterior(
     draws = {name: np.asarray(value, dtype=float) for name, value in samples.items() if np.ndim(value) == 1}
     if not draws:
         raise ValueError("`samples` must hold at least one scalar parameter, an entry of shape (S,).")
+    for name, values in draws.items():
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"`samples[{name!r}]` must be finite, got NaN or infinite draws: find out why first."
+            )
     if axes is None:
         figure, axes = pyplot().subplots(1, len(draws), figsize=(2.8 * len(draws), 2.0), layout="constrained")
         figure.get_layout_engine().set(w_pad=0.12)
