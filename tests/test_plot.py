@@ -1,0 +1,169 @@
+"""Drawings hold the data they are given, on the axes they are given."""
+
+import builtins
+
+import numpy as np
+import pytest
+
+from numpyro_bridges import datasets, plot
+
+matplotlib = pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+matplotlib.use("Agg")
+plt = pytest.importorskip("matplotlib.pyplot")
+
+
+@pytest.fixture(autouse=True)
+def _close():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def shapes():
+    return datasets.ellipses(num_points=12)
+
+
+@pytest.fixture(scope="module")
+def paths(shapes):
+    """(7, 21, 12, 2): straight lines from one ellipse to another with noise that vanishes at both ends."""
+    t = np.linspace(0.0, 1.0, 21)[:, None, None]
+    noise = np.random.default_rng(0).normal(size=(7, 21, 12, 2))
+    return (1.0 - t) * shapes.points[0] + t * shapes.points[3] + 0.1 * t * (1.0 - t) * noise
+
+
+def test_outlines(shapes):
+    lines = plot.outlines(shapes.points, mean=shapes.mean, linewidth=0.5, alpha=0.3)
+    assert lines.axes.get_aspect() == 1.0 and not lines.axes.axison
+    drawn = np.stack([path.vertices for path in lines.get_paths()])
+    np.testing.assert_array_equal(drawn[:, :-1], shapes.points)
+    np.testing.assert_array_equal(drawn[:, -1], shapes.points[:, 0])  # closed
+    assert (lines.get_linewidth()[0], lines.get_alpha()) == (0.5, 0.3)
+    mean = lines.axes.collections[1]
+    np.testing.assert_array_equal(mean.get_paths()[0].vertices[:-1], shapes.mean)
+    (x0, x1), (y0, y1) = lines.axes.get_xlim(), lines.axes.get_ylim()
+    low, high = shapes.points.min(axis=(0, 1)), shapes.points.max(axis=(0, 1))
+    assert x0 <= low[0] and y0 <= low[1] and x1 >= high[0] and y1 >= high[1]
+
+
+def test_one_open_outline_with_a_missing_point_on_given_axes(shapes):
+    figure, ax = plt.subplots()
+    outline = shapes.points[2].copy()
+    outline[4] = np.nan
+    lines = plot.outlines(outline, ax, closed=False)
+    assert lines.axes is ax and ax.axison and len(plt.get_fignums()) == 1
+    assert len(lines.get_paths()[0].vertices) == 12
+    figure.canvas.draw()
+
+
+def test_path(paths):
+    ts = np.linspace(0.0, 3.0, 21) ** 2
+    lines = plot.path(paths[0], ts=ts, num_outlines=5)
+    drawn = np.stack([path.vertices[:-1] for path in lines.get_paths()])
+    np.testing.assert_array_equal(drawn, paths[0][[0, 5, 10, 15, 20]])
+    np.testing.assert_array_equal(lines.get_array(), ts[[0, 5, 10, 15, 20]])
+    lines.figure.colorbar(lines)
+    lines.figure.canvas.draw()
+    assert lines.get_clim() == (0.0, 9.0)
+    assert len(plot.path(paths[0, :3], trajectories=False).axes.collections) == 1
+
+
+@pytest.mark.parametrize(("direction", "axis"), [("row", 0), ("column", 1)])
+def test_bridge_fan(shapes, paths, direction, axis):
+    frames = plot.bridge_fan(
+        paths, shapes.points[0], shapes.points[3], num_frames=3, direction=direction, max_outlines=5
+    )
+    frames[0].figure.canvas.draw()
+    assert [text.get_text() for text in frames[0].axes.texts] == ["$t = 0$", "$t = 0.5$", "$t = 1$"]
+    drawn = [np.stack([path.vertices[:-1] for path in frame.get_paths()]) for frame in frames]
+    for outlines, index in zip(drawn, [0, 10, 20], strict=True):
+        shift = outlines - paths[:5, index]
+        np.testing.assert_allclose(shift, np.broadcast_to(shift[0, 0], shift.shape), atol=1e-12)
+    ends = [(outlines[..., axis].min(), outlines[..., axis].max()) for outlines in drawn]
+    ends = ends if direction == "row" else [(-high, -low) for low, high in ends]
+    assert ends[0][1] < ends[1][0] and ends[1][1] < ends[2][0]  # frames do not overlap
+
+
+def test_score_field(shapes):
+    points = shapes.points[1]
+    arrows = np.arange(24.0).reshape(12, 2)
+    quiver = plot.score_field(points, arrows, length=0.5)
+    drawn = np.stack([quiver.U, quiver.V], axis=1)
+    np.testing.assert_allclose(drawn, arrows * 0.5 / np.linalg.norm(arrows[-1]))
+    quiver.figure.canvas.draw()
+    assert np.all(quiver.axes.get_xlim()[1] >= (points + drawn)[:, 0].max())
+    assert not plot.score_field(points, np.zeros((12, 2))).U.any()
+
+
+def test_posterior():
+    rng = np.random.default_rng(0)
+    samples = {
+        "location": rng.normal(size=4000),
+        "scale": np.abs(rng.normal(size=4000)),
+        "noise": np.ones((4, 2)),
+    }
+    prior = {"location": 3.0 * rng.normal(size=4000), "elsewhere": np.ones(9)}
+    areas = plot.posterior(samples, prior, truth={"scale": 0.5})
+    areas[0].figure.canvas.draw()
+    assert [area.axes.get_xlabel() for area in areas] == ["location", "scale"]
+    before, posterior = (areas[0].axes.lines[i].get_xydata().T for i in range(2))
+    after = areas[1].axes.lines[0].get_xydata().T
+    # A kernel estimate from 4000 draws has a standard error of about 0.01 here.
+    np.testing.assert_allclose(
+        posterior[1], np.exp(-(posterior[0] ** 2) / 2.0) / np.sqrt(2.0 * np.pi), atol=0.04
+    )
+    np.testing.assert_allclose(
+        before[1], np.exp(-(before[0] ** 2) / 18.0) / np.sqrt(18.0 * np.pi), atol=0.015
+    )
+    np.testing.assert_allclose(after[1], np.exp(-(after[0] ** 2) / 2.0) * np.sqrt(2.0 / np.pi), atol=0.09)
+    assert after[0].min() == 0.0
+    for grid, density in (posterior, after):
+        step = grid[1] - grid[0]
+        area = step * (density.sum() - density[[0, -1]].sum() / 2.0)
+        assert area == pytest.approx(1.0, abs=0.02)
+    low, high = areas[0].axes.lines[2].get_xdata()
+    np.testing.assert_allclose((low, high), np.quantile(samples["location"], [0.05, 0.95]))
+
+
+def test_posterior_of_equal_draws_on_given_axes():
+    _, ax = plt.subplots()
+    (area,) = plot.posterior({"a": np.full(10, 2.0)}, axes=ax)
+    assert area.axes is ax
+    ax.figure.canvas.draw()
+
+
+def test_errors(shapes, paths):
+    points = shapes.points[0]
+    with pytest.raises(
+        ValueError, match=r"`shapes` must have the shape \(n, 2\) or \(N, n, 2\), got \(5, 3\).*:2"
+    ):
+        plot.outlines(np.ones((5, 3)))
+    with pytest.raises(ValueError, match=r"`path` must have the shape \(K \+ 1, n, 2\), got \(12, 2\)"):
+        plot.path(points)
+    with pytest.raises(
+        ValueError, match=r"`ts` must have the shape \(21,\), one time for each state, got \(4,\)"
+    ):
+        plot.path(paths[0], ts=np.arange(4.0))
+    with pytest.raises(ValueError, match=r"`paths` must have the shape \(S, K \+ 1, n, 2\)"):
+        plot.bridge_fan(paths[0], points, points)
+    with pytest.raises(ValueError, match=r"`arrows` must have the shape of `points` \(12, 2\), got \(3, 2\)"):
+        plot.score_field(points, points[:3])
+    with pytest.raises(ValueError, match="at least one scalar parameter"):
+        plot.posterior({"noise": np.ones((4, 2))})
+    with pytest.raises(ValueError, match=r"`samples\['a'\]` must be finite"):
+        plot.posterior({"a": np.array([1.0, np.nan])})
+    with pytest.raises(ValueError, match=r"`axes` must be as many as the parameters \['a', 'b'\], got 1"):
+        plot.posterior({"a": np.arange(3.0), "b": np.arange(3.0)}, axes=plt.subplots()[1])
+
+
+def test_without_matplotlib(monkeypatch, shapes):
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.startswith("matplotlib"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    for draw in (lambda: plot.outlines(shapes.points), lambda: plot.posterior({"a": np.arange(3.0)})):
+        with pytest.raises(ImportError, match=r"pip install 'numpyro_bridges\[examples\]'"):
+            draw()
