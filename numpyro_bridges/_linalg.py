@@ -1,0 +1,85 @@
+"""Linear maps that act on the first axis of a state, stored by their shape.
+
+`()` is a multiple of the identity, `(n,)` a diagonal, `(m, n)` a matrix. A state is `(n,)` or `(n, dim)`; the same
+map acts on every column, so no Kronecker product is ever formed. The rank is known when a program is traced: a
+scalar or diagonal problem compiles to elementwise work.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+
+from ._types import State, Structured
+
+
+def _rows(d, x):
+    """A diagonal `d` shaped to scale the rows of `x`."""
+    return d.reshape(d.shape + (1,) * (x.ndim - 1))
+
+
+def apply(A: Structured, x: State) -> State:
+    """A x."""
+    if A.ndim == 0:
+        return A * x
+    return _rows(A, x) * x if A.ndim == 1 else A @ x
+
+
+def transpose(A: Structured) -> Structured:
+    """Aᵀ."""
+    return A.T
+
+
+def compose(A: Structured, B: Structured) -> Structured:
+    """A B."""
+    if A.ndim == 0 or B.ndim == 0:
+        return A * B
+    if A.ndim == 1:
+        return A * B if B.ndim == 1 else A[:, None] * B
+    return A * B[None, :] if B.ndim == 1 else A @ B
+
+
+def congruence(A: Structured, S: Structured) -> Structured:
+    """A S Aᵀ, of the same or a larger rank than S."""
+    return S * (A @ A.T) if A.ndim == 2 and S.ndim == 0 else compose(compose(A, S), transpose(A))
+
+
+def add(A: Structured, B: Structured) -> Structured:
+    """A + B."""
+    if A.ndim < B.ndim:
+        A, B = B, A
+    if A.ndim == 2 and B.ndim < 2:
+        i = jnp.arange(A.shape[0])
+        return A.at[i, i].add(B)
+    return A + B
+
+
+def promote(A: Structured, ndim: int, n: int) -> Structured:
+    """The same map with at least the given rank, `n` being the size of the state."""
+    if A.ndim == 0 and ndim >= 1:
+        A = jnp.full((n,), A)
+    return jnp.diag(A) if A.ndim == 1 and ndim == 2 else A
+
+
+def cholesky(S: Structured) -> Structured:
+    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite."""
+    return jnp.sqrt(S) if S.ndim < 2 else lax.linalg.cholesky(S, symmetrize_input=False)
+
+
+def solve_lower(C: Structured, x: State, transposed: bool = False) -> State:
+    """C⁻¹ x, or C⁻ᵀ x, for a lower triangular C."""
+    if C.ndim < 2:
+        return x / (C if C.ndim == 0 else _rows(C, x))
+    columns = x if x.ndim == 2 else x[:, None]
+    out = lax.linalg.triangular_solve(C, columns, left_side=True, lower=True, transpose_a=transposed)
+    return out.reshape(x.shape)
+
+
+def log_diagonal(C: Structured, m: int):
+    """log|C| of a triangular C that acts on `m` rows."""
+    if C.ndim == 0:
+        return m * jnp.log(C)
+    return jnp.sum(jnp.log(C if C.ndim == 1 else jnp.diagonal(C)))
+
+
+def columns(x: State) -> int:
+    """Number of columns that share a covariance: `dim`, 1 for a vector."""
+    return x.shape[1] if x.ndim == 2 else 1

@@ -1,0 +1,97 @@
+"""What is seen of the end state.
+
+A *match* is a model of observation; `match.at(v)` is a *condition*, the match at its datum. A bridge asks a condition
+for three things: the linear observation that it makes of the end state, a value near which to linearise, and the
+value that a path is led to, which is the datum itself or, for a set, a draw inside it.
+"""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .._linalg import apply, congruence
+from .._types import State, Structured
+from ..sdes import AbstractSDE
+
+
+class Observation(eqx.Module):
+    """v = operator x + N(0, factor factorᵀ), or v = operator x where `factor` is None; density times exp(log_scale)."""
+
+    operator: Structured
+    factor: Structured | None
+    log_scale: Float[Array, ""]
+
+    @property
+    def covariance(self) -> Structured | None:
+        """factor factorᵀ."""
+        P = self.factor
+        return P if P is None else congruence(P, jnp.ones((), P.dtype))
+
+
+class Target(eqx.Module):
+    """The value that the path is led to, and the log weight of having chosen it."""
+
+    value: State
+    log_weight: Float[Array, ""]
+
+
+class AbstractCondition(eqx.Module):
+    """An event, or an observed value, of the end state."""
+
+    exact: eqx.AbstractVar[bool]
+    """Whether the end state is pinned; decides the default grid."""
+
+    num_extra_noises: eqx.AbstractClassVar[int]
+    """Rows of noise that choose the target, before the first step."""
+
+    @abc.abstractmethod
+    def check(self, sde: AbstractSDE, x: State) -> None:
+        """`ValueError` where the condition does not fit states shaped like x."""
+
+    @abc.abstractmethod
+    def observation(self, sde: AbstractSDE, x: State) -> Observation:
+        """What is seen of a state shaped like x."""
+
+    @abc.abstractmethod
+    def reference(self, sde: AbstractSDE, x: State) -> State:
+        """A state like x that meets the condition: where an auxiliary process is linearised."""
+
+    @abc.abstractmethod
+    def log_value(self, law_mean: State, law_factor: Structured) -> Float[Array, ""]:
+        """log h̃: the density, or the probability, of the condition under N(mean, factor factorᵀ) for what is seen."""
+
+    @abc.abstractmethod
+    def target(self, law_mean: State, law_factor: Structured, noise: Float[Array, "extra k *dim"]) -> Target:
+        """The value to be led to, given the guide's law N(mean, factor factorᵀ) of what is seen."""
+
+    @abc.abstractmethod
+    def noise_from_target(self, law_mean: State, law_factor: Structured, seen: State) -> Float[Array, "extra m *dim"]:
+        """The extra noise with which `target` chooses `seen`."""
+
+
+class AbstractMatch(eqx.Module):
+    """A model of observation of the end state."""
+
+    @abc.abstractmethod
+    def at(self, observed) -> AbstractCondition:
+        """The condition that `observed` was seen."""
+
+    @abc.abstractmethod
+    def sample(self, key: PRNGKeyArray, sde: AbstractSDE, x: State) -> Array:
+        """An observation of the end state x."""
+
+    @abc.abstractmethod
+    def check_density(self) -> None:
+        """`ValueError` if `at(v)`'s evidence is not a density of what `sample` draws."""
+
+
+def lift(operator: Structured, x: State, value: State) -> State:
+    """The state nearest to x with `operator` x = value."""
+    if operator.ndim == 0:
+        return value / operator
+    if operator.ndim == 1:
+        d = operator if x.ndim == 1 else operator[:, None]
+        return jnp.where(d == 0, x, value / jnp.where(d == 0, 1, d))
+    return x + jnp.linalg.pinv(operator) @ (value - apply(operator, x))

@@ -1,0 +1,52 @@
+"""A Gaussian message: a linear observation of a state with Gaussian noise, as a function of the state.
+
+    h(x) = exp(log_scale) N(v; L x + shift, P Pᵀ ⊗ I_dim)
+
+This covariance form holds what a backward filter passes on: it stays finite for exact observations (P = 0) and costs no
+more than the information form h(x) = exp(c + Fᵀx − ½ xᵀHx), since L has at most as many rows as the state. Any Gaussian
+message, of any rank, has it: with H = RᵀR take L = R, P = 1.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._linalg import apply, columns, log_diagonal, promote, solve_lower, transpose
+from .._types import State, Structured
+
+_LOG_2PI = 1.8378770664093453
+
+
+class GaussianMessage(eqx.Module):
+    """h(x) = exp(log_scale) N(observed; operator x + shift, factor factorᵀ)."""
+
+    operator: Structured
+    shift: State
+    factor: Structured
+    observed: State
+    log_scale: Float[Array, ""]
+
+    def residual(self, x: State) -> State:
+        """P⁻¹ (v − L x − shift)."""
+        return solve_lower(self.factor, self.observed - self.shift - apply(self.operator, x))
+
+    def log_value(self, x: State) -> Float[Array, ""]:
+        """log h(x)."""
+        return self.log_scale + whitened_log_density(self.residual(x), self.factor)
+
+    def score(self, x: State) -> State:
+        """∇ log h(x) = Lᵀ (P Pᵀ)⁻¹ (v − L x − shift)."""
+        return apply(transpose(self.operator), solve_lower(self.factor, self.residual(x), transposed=True))
+
+    def information(self, n: int) -> tuple[Float[Array, "n n"], State, Float[Array, ""]]:
+        """H, F and c with log h(x) = c + Fᵀx − ½ xᵀHx, for states of n rows."""
+        m = self.observed.shape[0]
+        root = solve_lower(promote(self.factor, 2, m), promote(self.operator, 2, n))
+        v = solve_lower(self.factor, self.observed - self.shift)
+        return root.T @ root, root.T @ v, self.log_scale + whitened_log_density(v, self.factor)
+
+
+def whitened_log_density(y: State, factor: Structured) -> Float[Array, ""]:
+    """log N(r; 0, P Pᵀ) from y = P⁻¹ r."""
+    m, dim = y.shape[0], columns(y)
+    return -0.5 * jnp.sum(y * y) - dim * (log_diagonal(factor, m) + 0.5 * m * _LOG_2PI)

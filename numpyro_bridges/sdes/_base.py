@@ -1,0 +1,163 @@
+"""A stochastic differential equation on H, dX = b(t, X) dt + σ(t, X) dW (Itô), and its one-step Gaussian transition.
+
+States are `(n, dim)` or `(n,)`; σ acts on the first axis, so a = σσᵀ is n × n and the same for every column.
+"""
+
+import abc
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._linalg import add, apply
+from .._types import Noise, RealScalar, State, Structured
+from ..spaces import AbstractSpace
+
+_MAX_LINEARISED = 64
+"""Largest state, n · dim numbers, whose drift is linearised by its full Jacobian."""
+
+
+class Transition(eqx.Module):
+    """One step of the time-discretised model, x' = mean + factor u with u ~ N(0, I), where covariance = factor factorᵀ."""
+
+    mean: State
+    factor: Structured
+    covariance: Structured
+
+
+class AffineStep(eqx.Module):
+    """One step of a linear process, x' ~ N(operator x + shift, covariance)."""
+
+    operator: Structured
+    shift: State
+    covariance: Structured
+
+
+class DiffusionTerm(diffrax.AbstractTerm):
+    """σ(t, x) dW as a diffrax term: σ acts on the first axis of the increment `(k, dim)`."""
+
+    vector_field: Callable
+    control: diffrax.AbstractPath
+
+    def vf(self, t, y, args):
+        return self.vector_field(t, y)
+
+    def contr(self, t0, t1, **kwargs):
+        return self.control.evaluate(t0, t1, **kwargs)
+
+    def prod(self, vf, control):
+        return jax.tree.map(lambda dw: apply(vf, dw), control)
+
+
+class AbstractSDE(eqx.Module):
+    """dX = b(t, X) dt + σ(t, X) dW. A subclass gives `drift` and `noise`; parameters are array leaves."""
+
+    space: eqx.AbstractVar[AbstractSpace | None]
+    """Where states live; `None` is Euclidean space."""
+
+    @abc.abstractmethod
+    def drift(self, t: RealScalar, x: State) -> State:
+        """b(t, x), shaped like x."""
+
+    @abc.abstractmethod
+    def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
+        """σ(t, x) and a(t, x) = σσᵀ, computed together."""
+
+    @abc.abstractmethod
+    def has_constant_covariance(self, x: State) -> bool:
+        """Whether a(t, x) is known not to depend on x; decides the default guide."""
+
+    def diffusion(self, t: RealScalar, x: State) -> Structured:
+        """σ(t, x)."""
+        return self.noise(t, x)[0]
+
+    def covariance(self, t: RealScalar, x: State) -> Structured:
+        """a(t, x) = σσᵀ: `()`, `(n,)` or `(n, n)`."""
+        return self.noise(t, x)[1]
+
+    def noise_size(self, x: State) -> int:
+        """Number k of driving noises per column."""
+        factor = jax.eval_shape(self.diffusion, 0.0, x)
+        return factor.shape[1] if len(factor.shape) == 2 else x.shape[0]
+
+    def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
+        """The model's step from t0 to t1; Euler–Maruyama unless the class has its exact law."""
+        dt = t1 - t0
+        factor, covariance = self.noise(t0, x)
+        return Transition(x + dt * self.drift(t0, x), jnp.sqrt(dt) * factor, dt * covariance)
+
+    def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
+        """B and β with b(t, y) ≈ B y + β near x; B = 0 for states of more than 64 numbers.
+
+        B acts on the first axis: for `dim` > 1 it is the mean over columns of the Jacobian's diagonal blocks.
+        """
+        b = self.drift(t, x)
+        if x.size > _MAX_LINEARISED:
+            return jnp.zeros((), x.dtype), b
+        jacobian = jax.jacfwd(self.drift, argnums=1)(t, x)
+        B = jacobian if x.ndim == 1 else jnp.einsum("idjd->ij", jacobian) / x.shape[1]
+        return B, b - apply(B, x)
+
+    def linearised_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        """The model's step with drift and covariance linearised at x."""
+        dt = t1 - t0
+        B, beta = self.linearised_drift(t0, x)
+        operator = add(jnp.ones((), x.dtype), dt * B)
+        return AffineStep(operator, dt * beta, dt * self.covariance(t0, x))
+
+    def auxiliary_step(self, auxiliary: "AbstractSDE", t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        """A linear auxiliary process, stepped by the scheme that steps this SDE."""
+        dt = t1 - t0
+        B, beta = auxiliary.linearised_drift(t0, x)
+        return AffineStep(add(jnp.ones((), x.dtype), dt * B), dt * beta, dt * auxiliary.covariance(t0, x))
+
+    def ito_is_stratonovich(self, x: State) -> bool:
+        """Whether the Itô and the Stratonovich reading coincide, so that Stratonovich solvers are right too."""
+        return self.has_constant_covariance(x)
+
+    def terms(self, control: diffrax.AbstractPath) -> diffrax.MultiTerm:
+        """diffrax terms, driven by `control` with values `(k, dim)`."""
+        return diffrax.MultiTerm(
+            diffrax.ODETerm(lambda t, y, args: self.drift(t, y)), DiffusionTerm(self.diffusion, control)
+        )
+
+    def check_state(self, x: State) -> None:
+        """`ValueError` where x cannot be a state of this SDE."""
+        factor, _ = jax.eval_shape(self.noise, 0.0, x)
+        drift = jax.eval_shape(self.drift, 0.0, x)
+        if drift.shape != x.shape:
+            raise ValueError(
+                f"`drift` must return an array shaped like the state, {x.shape}; got {drift.shape}. "
+                "A parameter with a batch axis does this too: vmap over it."
+            )
+        if factor.shape and factor.shape[0] != x.shape[0]:
+            raise ValueError(
+                f"`diffusion` must be a scalar, a diagonal ({x.shape[0]},) or a matrix ({x.shape[0]}, k); "
+                f"got {factor.shape} for a state {x.shape}."
+            )
+
+
+def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
+    """A path of the model, unconditioned.
+
+    **Arguments:** `x0` `(n, dim)`; `ts` `(K + 1,)`; `noise` `(K, k, dim)`, standard normal.
+
+    **Returns:** `(K + 1, n, dim)`, the first state being `x0`.
+    """
+
+    def step(x, inputs):
+        t0, t1, z = inputs
+        law = sde.transition(t0, t1, x)
+        x = law.mean + apply(law.factor, z.reshape(z.shape[: x.ndim]))
+        return x, x
+
+    _, path = jax.lax.scan(step, x0, (ts[:-1], ts[1:], noise))
+    return jnp.concatenate([x0[None], path])
+
+
+def as_state_shift(shift, x: State) -> State:
+    """β, scalar, `(n,)` or `(n, dim)`, shaped like x."""
+    shift = shift[:, None] if shift.ndim == 1 and x.ndim == 2 else shift
+    return jnp.broadcast_to(shift, x.shape)

@@ -1,0 +1,168 @@
+"""Linear SDEs, stepped by their exact law.
+
+    dX = (B X + β) dt + σ dW:   X_{t+τ} | X_t ~ N(e^{Bτ} X_t + ∫₀^τ e^{Bu} β du,  ∫₀^τ e^{Bu} σσᵀ e^{Bᵀu} du)
+
+The integrals are elementwise for a scalar or diagonal B, and one matrix exponential otherwise (Van Loan 1978).
+"""
+
+import jax.numpy as jnp
+from jax.scipy.linalg import expm
+from jaxtyping import Array
+
+from .._checks import as_float, concrete, require, require_finite
+from .._linalg import apply, cholesky, compose, congruence, transpose
+from .._types import RealScalar, State, Structured
+from ..spaces import AbstractSpace
+from ._base import AbstractSDE, AffineStep, Transition, as_state_shift
+
+
+def _phi1(x: Array) -> Array:
+    """(eˣ − 1)/x, 1 at x = 0."""
+    safe = jnp.where(x == 0, 1.0, x)
+    return jnp.where(x == 0, 1.0, jnp.expm1(safe) / safe)
+
+
+def _psd_cholesky(S: Structured) -> Structured:
+    """Cholesky factor of a covariance that may be singular: a nugget of a few rounding errors per diagonal entry."""
+    if S.ndim < 2:
+        return cholesky(S)
+    d = jnp.diagonal(S)
+    eps = jnp.finfo(S.dtype).eps
+    return cholesky(S + jnp.diag(4 * eps * d + 1e-24 * jnp.max(d)))
+
+
+class BrownianMotion(AbstractSDE):
+    """Brownian motion with a covariance operator, dX = Q^½ dW.
+
+    **Arguments:**
+
+    - `covariance`: Q, `()`, `(n,)` (a diagonal) or `(n, n)`, positive definite.
+    - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
+    """
+
+    covariance_operator: Structured
+    space: AbstractSpace | None
+
+    def __init__(self, covariance, *, space: AbstractSpace | None = None):
+        self.covariance_operator = _covariance(covariance, "covariance")
+        self.space = space
+
+    def drift(self, t: RealScalar, x: State) -> State:
+        return jnp.zeros_like(x)
+
+    def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
+        return cholesky(self.covariance_operator), self.covariance_operator
+
+    def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
+        return jnp.zeros((), x.dtype), jnp.zeros_like(x)
+
+    def has_constant_covariance(self, x: State) -> bool:
+        return True
+
+
+class LinearSDE(AbstractSDE):
+    """A linear SDE, dX = (B X + β) dt + σ dW, with its exact transition.
+
+    Ornstein–Uhlenbeck: `LinearSDE(-rate, sigma, rate * mean)`. The stochastic heat equation on a
+    `FourierBasis`: `LinearSDE(-diffusivity * frequencies**2, sigma)`, a diagonal.
+
+    **Arguments:**
+
+    - `drift`: B, `()`, `(n,)` (a diagonal) or `(n, n)`.
+    - `diffusion`: σ, `()`, `(n,)` or `(n, k)`; k < n is allowed (hypo-elliptic noise).
+    - `shift`: β, `()`, `(n,)` or `(n, dim)`.
+    - `space`: where states live; Euclidean if not given.
+    """
+
+    drift_operator: Structured
+    diffusion_operator: Structured
+    shift: Array
+    space: AbstractSpace | None
+
+    def __init__(self, drift, diffusion, shift=0.0, *, space: AbstractSpace | None = None):
+        self.drift_operator = as_float(drift, "drift")
+        self.diffusion_operator = as_float(diffusion, "diffusion")
+        self.shift = as_float(shift, "shift")
+        self.space = space
+        for name, value in (
+            ("drift", self.drift_operator),
+            ("diffusion", self.diffusion_operator),
+            ("shift", self.shift),
+        ):
+            require_finite(value, name)
+            require(value.ndim <= 2, f"`{name}` must be a scalar, a vector or a matrix; got shape {value.shape}.")
+        B = self.drift_operator
+        require(B.ndim < 2 or B.shape[0] == B.shape[1], f"`drift` must be square; got shape {B.shape}.")
+
+    def drift(self, t: RealScalar, x: State) -> State:
+        return apply(self.drift_operator, x) + as_state_shift(self.shift, x)
+
+    def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
+        sigma = self.diffusion_operator
+        return sigma, compose(sigma, transpose(sigma))
+
+    def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
+        return self.drift_operator, as_state_shift(self.shift, x)
+
+    def has_constant_covariance(self, x: State) -> bool:
+        return True
+
+    def exact_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        """The exact affine Gaussian law of X at t1 given X at t0, for states shaped like x."""
+        dt = t1 - t0
+        B, sigma, beta = self.drift_operator, self.diffusion_operator, as_state_shift(self.shift, x)
+        a = compose(sigma, transpose(sigma))
+        if B.ndim < 2:
+            rate = B if a.ndim < 2 or B.ndim == 0 else 0.5 * (B[:, None] + B[None, :])
+            mean_map = dt * _phi1(dt * B)
+            if B.ndim == 1 and x.ndim == 2:
+                mean_map = mean_map[:, None]
+            return AffineStep(jnp.exp(dt * B), mean_map * beta, dt * _phi1(2 * dt * rate) * a)
+        n = B.shape[0]
+        a = a * jnp.eye(n, dtype=B.dtype) if a.ndim == 0 else jnp.diag(a) if a.ndim == 1 else a
+        zero = jnp.zeros((n, n), B.dtype)
+        van_loan = expm(dt * jnp.block([[-B, a], [zero, B.T]]))
+        operator = van_loan[n:, n:].T
+        S = operator @ van_loan[:n, n:]
+        columns = beta if beta.ndim == 2 else beta[:, None]
+        m = columns.shape[1]
+        augmented = jnp.block([[B, columns], [jnp.zeros((m, n + m), B.dtype)]])
+        shift = expm(dt * augmented)[:n, n:].reshape(beta.shape)
+        return AffineStep(operator, shift, 0.5 * (S + S.T))
+
+    def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
+        step = self.exact_step(t0, t1, x)
+        mean = apply(step.operator, x) + step.shift
+        if self.drift_operator.ndim == 0:
+            dt = t1 - t0
+            factor = jnp.sqrt(dt * _phi1(2 * dt * self.drift_operator)) * self.diffusion_operator
+            return Transition(mean, factor, step.covariance)
+        factor = _psd_cholesky(step.covariance)
+        return Transition(mean, factor, congruence(factor, jnp.ones((), x.dtype)))
+
+    def linearised_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        return self.exact_step(t0, t1, x)
+
+    def auxiliary_step(self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        return auxiliary.linearised_step(t0, t1, x)
+
+    def noise_size(self, x: State) -> int:
+        sigma = self.diffusion_operator
+        return sigma.shape[1] if sigma.ndim == 2 and self.drift_operator.ndim == 0 else x.shape[0]
+
+
+def _covariance(value, name: str) -> Array:
+    """A scalar, diagonal or matrix that is positive definite, where that can be known."""
+    Q = as_float(value, name)
+    require_finite(Q, name)
+    require(
+        Q.ndim < 2 or (Q.ndim == 2 and Q.shape[0] == Q.shape[1]), f"`{name}` must be (), (n,) or (n, n); got {Q.shape}."
+    )
+    if concrete(Q) is not None:
+        factor = cholesky(Q)
+        require(
+            jnp.all(jnp.isfinite(factor)) & jnp.all((factor if Q.ndim < 2 else jnp.diagonal(factor)) > 0),
+            f"`{name}` must be positive definite; its Cholesky factorisation fails. Remove duplicated points, or add a "
+            "small multiple of the identity.",
+        )
+    return Q

@@ -1,0 +1,77 @@
+"""A user's own SDE, from functions with diffrax's signature."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jax.extend.core import Literal
+
+from .._linalg import compose, transpose
+from .._types import RealScalar, State, Structured
+from ..spaces import AbstractSpace
+from ._base import AbstractSDE
+
+
+class _Static(eqx.Module):
+    """A function without parameters, which jit may hash."""
+
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, t, x, args):
+        return self.function(t, x, args)
+
+
+class SDE(AbstractSDE):
+    """dX = drift(t, X, args) dt + diffusion(t, X, args) dW, stepped by Euler–Maruyama.
+
+    **Arguments:**
+
+    - `drift`: `f(t, x, args)`, shaped like x.
+    - `diffusion`: `f(t, x, args)`: a scalar, a diagonal `(n,)`, a matrix `(n, k)` or a lineax operator. It acts on the
+      first axis of the state; k may be smaller (hypo-elliptic) or larger than n.
+    - `args`: the parameters, a pytree of arrays. Anything a prior is put on belongs here, or is a leaf of an
+      `equinox.Module` passed as `drift` or `diffusion`.
+    - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
+    """
+
+    drift_function: Callable
+    diffusion_function: Callable
+    args: Any
+    space: AbstractSpace | None
+
+    def __init__(self, drift: Callable, diffusion: Callable, args: Any = None, *, space: AbstractSpace | None = None):
+        for name, f in (("drift", drift), ("diffusion", diffusion)):
+            if not callable(f):
+                raise ValueError(
+                    f"`{name}` must be a function f(t, x, args); got {f!r}. Wrap it: `lambda t, x, args: ...`."
+                )
+        self.drift_function = drift if isinstance(drift, eqx.Module) else _Static(drift)
+        self.diffusion_function = diffusion if isinstance(diffusion, eqx.Module) else _Static(diffusion)
+        self.args = jax.tree.map(jnp.asarray, args)
+        self.space = space
+
+    def drift(self, t: RealScalar, x: State) -> State:
+        return jnp.asarray(self.drift_function(t, x, self.args), x.dtype)
+
+    def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
+        sigma = self.diffusion_function(t, x, self.args)
+        if isinstance(sigma, lx.AbstractLinearOperator):
+            sigma = lx.diagonal(sigma) if lx.is_diagonal(sigma) else sigma.as_matrix()
+        sigma = jnp.asarray(sigma, x.dtype)
+        return sigma, compose(sigma, transpose(sigma))
+
+    def has_constant_covariance(self, x: State) -> bool:
+        return not depends_on(lambda y: self.noise(0.0, y)[0], x)
+
+
+def depends_on(f: Callable, x: State) -> bool:
+    """Whether f(x) is computed from x, by following x through the traced program (a `True` may be over-cautious)."""
+    jaxpr = jax.make_jaxpr(f)(x).jaxpr
+    reached = set(jaxpr.invars)
+    for eqn in jaxpr.eqns:
+        if any(not isinstance(v, Literal) and v in reached for v in eqn.invars):
+            reached.update(eqn.outvars)
+    return any(not isinstance(v, Literal) and v in reached for v in jaxpr.outvars)
