@@ -75,8 +75,8 @@ class AbstractRadialKernel(AbstractKernel):
         """The kernel of unit amplitude and length scale at the squared distance s; 1 at 0."""
 
     def scales(self, dtype: jnp.dtype | None = None) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Amplitude and length scale in one dtype; `ValueError` if either has an axis."""
-        dtype = jnp.promote_types(self.amplitude.dtype, self.length_scale.dtype) if dtype is None else dtype
+        """Amplitude and length scale in one precision; `ValueError` if either has an axis."""
+        dtype = self.amplitude.dtype if dtype is None else dtype
         return scalar(self.amplitude, "amplitude", dtype), scalar(self.length_scale, "length_scale", dtype)
 
     def matrix(self, x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:

@@ -23,7 +23,7 @@ def scalar(value: Array, name: str, dtype: jnp.dtype) -> Float[Array, ""]:
 
 
 def positive_scalar(name: str) -> Callable[[ArrayLike], Float[Array, ""]]:
-    """A field converter: a positive, finite scalar of a floating dtype. Traced values pass."""
+    """A field converter: a positive, finite scalar of the default float type. Traced values pass."""
 
     def convert(value: ArrayLike) -> Float[Array, ""]:
         value = as_float(value, name)
@@ -34,9 +34,15 @@ def positive_scalar(name: str) -> Callable[[ArrayLike], Float[Array, ""]]:
     return convert
 
 
+def floating(x: ArrayLike, name: str) -> Float[Array, "..."]:
+    """An array that keeps its precision; whole numbers become the default float type."""
+    keeps = jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)
+    return jnp.asarray(x) if keeps else as_float(x, name)
+
+
 def points(x: ArrayLike, name: str) -> Float[Array, "n dim"]:
-    """Points as an array of a floating dtype, one a row."""
-    x = as_float(x, name)
+    """Points, one a row."""
+    x = floating(x, name)
     require(
         x.ndim == 2,
         f"`{name}` must hold one point a row, (n, dim); got shape {x.shape}. For a batch, use `jax.vmap`.",
@@ -56,7 +62,7 @@ def squared_distances(x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Flo
 
 def squared_frequency(omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
     """|ω|² of frequency vectors, the last axis being that of space."""
-    omega = as_float(omega, "omega")
+    omega = floating(omega, "omega")
     require(
         omega.ndim > 0 and omega.shape[-1] == dim,
         f"`omega` must hold frequency vectors of R^{dim}, (..., {dim}); got shape {jnp.shape(omega)}.",

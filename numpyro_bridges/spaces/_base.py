@@ -78,7 +78,7 @@ class AbstractSpace(eqx.Module):
 
         **Returns:** the state; where the points leave it open (repeated parameters), the one of least norm.
         """
-        values = as_float(values, "values")
+        values = floating(values, "values")
         require(
             values.ndim == 2 and values.shape[1] == self.dim and values.shape[0] >= self.size,
             f"`values` must be at least {self.size} points of dimension {self.dim}, one a row; got shape "
@@ -105,13 +105,19 @@ class AbstractSpace(eqx.Module):
 
     def _state(self, x: ArrayLike) -> Float[Array, "n dim"]:
         """A state, or `ValueError`: one row too few would broadcast."""
-        x = as_float(x, "x")
+        x = floating(x, "x")
         require(
             x.shape == (self.size, self.dim),
             f"a state of this space must have shape ({self.size}, {self.dim}); got {x.shape}. For a batch, "
             "use `jax.vmap`.",
         )
         return x
+
+
+def floating(x: ArrayLike, name: str) -> Float[Array, "..."]:
+    """An array that keeps its precision; whole numbers become the default float type."""
+    keeps = jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)
+    return jnp.asarray(x) if keeps else as_float(x, name)
 
 
 def equispaced(n: int) -> np.ndarray:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import as_float, concrete, require
-from ._base import AbstractSpace, equispaced, positive_integer
+from .._checks import concrete, require
+from ._base import AbstractSpace, equispaced, floating, positive_integer
 
 
 def fourier_functions(s: ArrayLike, num_modes: int) -> Any:
@@ -18,7 +18,7 @@ def fourier_functions(s: ArrayLike, num_modes: int) -> Any:
     In NumPy and double precision unless s is traced: single precision loses digits in cos ns for a large n.
     """
     known = concrete(s)
-    xp, s = (jnp, as_float(s, "s")) if known is None else (np, known.astype(float))
+    xp, s = (jnp, floating(s, "s")) if known is None else (np, known.astype(float))
     require(s.ndim == 1, f"`s` must be a vector of parameters; got shape {s.shape}.")
     angles = s[:, None] * xp.arange(1, num_modes + 1, dtype=s.dtype)[None]
     waves = xp.stack([xp.cos(angles), xp.sin(angles)], axis=-1).reshape(s.size, 2 * num_modes)
@@ -79,7 +79,7 @@ class FourierBasis(AbstractSpace):
 
     def from_points(self, values: Float[Array, "q ..."]) -> Float[Array, "n ..."]:
         """Φᵀ W f: exact for a field whose bandwidth and `num_modes` add up to less than `num_quadrature`."""
-        values = as_float(values, "values")
+        values = floating(values, "values")
         require(
             values.shape[:1] == (self.num_quadrature,),
             f"`values` must have a row for each of {self.num_quadrature} points; got shape {values.shape}.",
