@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .io import read_csv
 from .shapes import procrustes_align, resample
 
 
@@ -56,14 +55,15 @@ def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
     folder = _ktch_data() / "outline_mosquito_wings"
     with open(folder / "meta_outline_mosquito_wings.csv", encoding="utf-8", newline="") as file:
         genera = {row["specimen_id"]: row["genus"] for row in csv.DictReader(file)}
-    outlines = read_csv(folder / "data_outline_mosquito_wings.csv", id="specimen_id", point="coord_id")
-    chosen = {wing.id: wing.landmarks for wing in outlines if genus in (None, genera[str(wing.id)])}
+    chosen = [specimen for specimen, its in genera.items() if genus in (None, its)]
     if not chosen:
         available = ", ".join(f"{name!r} ({count})" for name, count in Counter(genera.values()).most_common())
         raise ValueError(f"`genus` must be one of {available}, or None for all; got {genus!r}.")
+    specimen, _, *xy = np.loadtxt(folder / "data_outline_mosquito_wings.csv", delimiter=",", skiprows=1, unpack=True)
+    outlines = [np.stack(xy, axis=1)[specimen == int(name)] for name in chosen]
     labels = tuple(genera[name] for name in chosen)
     names = tuple(f"{label} {name}" for label, name in zip(labels, chosen, strict=True))
-    wings = _in_register([resample(outline, num_points) for outline in chosen.values()], labels, names)
+    wings = _in_register([resample(outline, num_points) for outline in outlines], labels, names)
     return _along_x(wings)
 
 
@@ -110,7 +110,6 @@ def _ktch_data() -> Path:
     folders = spec.submodule_search_locations if spec is not None else None
     if not folders:
         raise ImportError(
-            "The outlines are in the package `ktch`, which is not installed: "
-            "pip install 'numpyro_bridges[examples]'"
+            "The outlines are in the package `ktch`, which is not installed: pip install 'numpyro_bridges[examples]'"
         )
     return Path(folders[0]) / "datasets" / "data"

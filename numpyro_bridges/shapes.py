@@ -88,8 +88,8 @@ def procrustes_align(
     every shape onto the mean, average (Gower 1975). With `scale`, every shape is first given unit RMS radius,
     and so is the mean (partial Procrustes: each shape keeps size one rather than being shrunk onto the mean).
 
-    A point with a NaN coordinate is missing. It is filled with the mean, fitted to the seen points of its
-    shape by translation and rotation (and size, with `scale`), in every iteration; it is returned as NaN.
+    A point with a NaN coordinate is missing. In every iteration it is filled with the mean, fitted to the seen
+    points of its shape by translation, rotation and size; it is returned as NaN.
 
     **Arguments:**
 
@@ -133,7 +133,7 @@ def procrustes_align(
     converged, iteration = False, 0
     while not converged and iteration < max_iterations:
         iteration += 1
-        filled = standard(_fill(shapes, missing, mean, scale))
+        filled = standard(_fill(shapes, missing, mean))
         aligned = filled @ _rotations(filled, mean)
         previous, mean = mean, standard(aligned.mean(axis=0))
         change = np.sqrt(np.mean(np.sum((mean - previous) ** 2, axis=-1)))
@@ -186,14 +186,14 @@ def _rotations(shapes: NDArray, target: NDArray) -> NDArray:
     return u @ vt
 
 
-def _fill(shapes: NDArray, missing: NDArray, mean: NDArray, scale: bool) -> NDArray:
+def _fill(shapes: NDArray, missing: NDArray, mean: NDArray) -> NDArray:
     """Shapes with missing points taken from the mean after it is fitted to the seen ones."""
     filled = shapes.copy()
     for shape, gone in zip(filled, missing, strict=True):
         if gone.any():
             seen, mean_seen = center(shape[~gone]), center(mean[~gone])
             rotation = _rotations(mean_seen, seen)
-            size = np.sum((mean_seen @ rotation) * seen) / np.sum(mean_seen**2) if scale else 1.0
+            size = np.sum((mean_seen @ rotation) * seen) / np.sum(mean_seen**2)
             offset = shape[~gone].mean(axis=0)
             shape[gone] = size * (mean[gone] - mean[~gone].mean(axis=0)) @ rotation + offset
     return filled

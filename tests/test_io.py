@@ -96,9 +96,7 @@ class TestReadTps:
 
     def test_encoding(self, file):
         path = file("LM=1\n0 0\nID=Käfer\n".encode("cp1252"))
-        with pytest.raises(
-            ValueError, match=r"shapes.tps: expected text .*'utf-8', found byte 0xe4. Pass its"
-        ):
+        with pytest.raises(ValueError, match=r"shapes.tps: expected text .*'utf-8', found byte 0xe4. Pass its"):
             read_tps(path)
         assert read_tps(path, encoding="cp1252")[0].id == "Käfer"
 
@@ -268,9 +266,7 @@ class TestWriteCsv:
             write_csv(path, [one], layout="tall")
         with pytest.raises(ValueError, match="at least one specimen"):
             write_csv(path, [])
-        with pytest.raises(
-            ValueError, match=r"`specimens\[0\]` has curves, an image or a scale.*`write_tps`"
-        ):
+        with pytest.raises(ValueError, match=r"`specimens\[0\]` has curves, an image or a scale.*`write_tps`"):
             write_csv(path, [Specimen(np.ones((1, 2)), scale=1.0)])
         with pytest.raises(
             ValueError, match=r"`specimens\[1\]` has landmarks of shape \(2, 2\), the first of \(1, 2\)"

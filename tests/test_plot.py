@@ -108,12 +108,8 @@ def test_posterior():
     before, posterior = (areas[0].axes.lines[i].get_xydata().T for i in range(2))
     after = areas[1].axes.lines[0].get_xydata().T
     # A kernel estimate from 4000 draws has a standard error of about 0.01 here.
-    np.testing.assert_allclose(
-        posterior[1], np.exp(-(posterior[0] ** 2) / 2.0) / np.sqrt(2.0 * np.pi), atol=0.04
-    )
-    np.testing.assert_allclose(
-        before[1], np.exp(-(before[0] ** 2) / 18.0) / np.sqrt(18.0 * np.pi), atol=0.015
-    )
+    np.testing.assert_allclose(posterior[1], np.exp(-(posterior[0] ** 2) / 2.0) / np.sqrt(2.0 * np.pi), atol=0.04)
+    np.testing.assert_allclose(before[1], np.exp(-(before[0] ** 2) / 18.0) / np.sqrt(18.0 * np.pi), atol=0.015)
     np.testing.assert_allclose(after[1], np.exp(-(after[0] ** 2) / 2.0) * np.sqrt(2.0 / np.pi), atol=0.09)
     assert after[0].min() == 0.0
     for grid, density in (posterior, after):
@@ -133,15 +129,11 @@ def test_posterior_of_equal_draws_on_given_axes():
 
 def test_errors(shapes, paths):
     points = shapes.points[0]
-    with pytest.raises(
-        ValueError, match=r"`shapes` must have the shape \(n, 2\) or \(N, n, 2\), got \(5, 3\).*:2"
-    ):
+    with pytest.raises(ValueError, match=r"`shapes` must have the shape \(n, 2\) or \(N, n, 2\), got \(5, 3\).*:2"):
         plot.outlines(np.ones((5, 3)))
     with pytest.raises(ValueError, match=r"`path` must have the shape \(K \+ 1, n, 2\), got \(12, 2\)"):
         plot.path(points)
-    with pytest.raises(
-        ValueError, match=r"`ts` must have the shape \(21,\), one time for each state, got \(4,\)"
-    ):
+    with pytest.raises(ValueError, match=r"`ts` must have the shape \(21,\), one time for each state, got \(4,\)"):
         plot.path(paths[0], ts=np.arange(4.0))
     with pytest.raises(ValueError, match=r"`paths` must have the shape \(S, K \+ 1, n, 2\)"):
         plot.bridge_fan(paths[0], points, points)

@@ -101,9 +101,7 @@ class TestProcrustes:
         aligned, mean, _, converged = shapes.procrustes_align(copies)
         assert converged
         np.testing.assert_allclose(aligned, np.broadcast_to(mean, aligned.shape), atol=1e-12)
-        np.testing.assert_allclose(
-            mean, shapes.unit_size(copies[0]), atol=1e-12
-        )  # the first one's orientation
+        np.testing.assert_allclose(mean, shapes.unit_size(copies[0]), atol=1e-12)  # the first one's orientation
 
     @pytest.mark.parametrize("dim", [2, 3])
     def test_pair_against_scipy(self, rng, dim):
@@ -135,6 +133,12 @@ class TestProcrustes:
         gap = shapes.procrustes_align(two.mean[None], one.mean).shapes[0] - one.mean
         np.testing.assert_allclose(gap, 0.0, atol=1e-8)
 
+    def test_first_complete_shape_keeps_its_orientation(self, rng):
+        _, copies = scatter(rng, noise=0.5)
+        copies[0, 0] = np.nan
+        aligned = shapes.procrustes_align(copies)
+        np.testing.assert_allclose(aligned.shapes[1], shapes.unit_size(copies[1]), atol=1e-12)
+
     def test_rotates_but_never_reflects(self, rng):
         base, _ = scatter(rng)
         mirrored = base * [-1.0, 1.0]
@@ -146,8 +150,6 @@ class TestProcrustes:
     @pytest.mark.parametrize("scale", [True, False])
     def test_missing_points_of_exact_copies(self, rng, scale):
         base, copies = scatter(rng, dim=3, noise=0.0)
-        if not scale:
-            copies = copies / shapes.rms_radius(copies)[:, None, None]
         complete = shapes.procrustes_align(copies, scale=scale)
         missing = np.zeros(copies.shape[:2], bool)
         missing[[1, 1, 4], [0, 5, 8]] = True

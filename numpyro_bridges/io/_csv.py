@@ -144,9 +144,7 @@ def _read_long(path: str | PathLike, header: list[str], rows: _Rows, id: str, po
     groups: dict[str | None, list[tuple[int, dict[str, str]]]] = {}
     for line, row in rows:
         groups.setdefault(row.get(id) or None, []).append((line, row))
-    constant = [
-        name for name in others if all(len({row[name] for _, row in group}) == 1 for group in groups.values())
-    ]
+    constant = [name for name in others if all(len({row[name] for _, row in group}) == 1 for group in groups.values())]
     specimens = []
     for name, group in groups.items():
         ordered = _in_order(path, group, point) if point in header else group

@@ -30,9 +30,7 @@ _FIELDS = {"IMAGE": "image", "ID": "id", "SCALE": "scale"}
 _RESERVED = {*_BLOCKS, *_FIELDS, "CURVES", "POINTS"}
 
 
-def read_tps(
-    path: str | PathLike, *, negative_is_missing: bool = False, encoding: str = "utf-8"
-) -> list[Specimen]:
+def read_tps(path: str | PathLike, *, negative_is_missing: bool = False, encoding: str = "utf-8") -> list[Specimen]:
     """Specimens of a tps file, in its order.
 
     Keys may be in any case; blank lines and blanks at the end of a line do not matter. Keys other than LM,

@@ -61,9 +61,7 @@ def time_map() -> Any:
 def as_times(ts: ArrayLike | None, num_times: int) -> NDArray:
     times = np.linspace(0.0, 1.0, num_times) if ts is None else np.asarray(ts, dtype=float)
     if times.shape != (num_times,):
-        raise ValueError(
-            f"`ts` must have the shape ({num_times},), one time for each state, got {times.shape}."
-        )
+        raise ValueError(f"`ts` must have the shape ({num_times},), one time for each state, got {times.shape}.")
     return times
 
 

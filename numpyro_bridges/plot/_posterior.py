@@ -37,9 +37,7 @@ def posterior(
         raise ValueError("`samples` must hold at least one scalar parameter, an entry of shape (S,).")
     for name, values in draws.items():
         if not np.isfinite(values).all():
-            raise ValueError(
-                f"`samples[{name!r}]` must be finite, got NaN or infinite draws: find out why first."
-            )
+            raise ValueError(f"`samples[{name!r}]` must be finite, got NaN or infinite draws: find out why first.")
     if axes is None:
         figure, axes = pyplot().subplots(1, len(draws), figsize=(2.8 * len(draws), 2.0), layout="constrained")
         figure.get_layout_engine().set(w_pad=0.12)
