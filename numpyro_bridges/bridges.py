@@ -370,4 +370,7 @@ def _driving_noise(transition: Transition, x: State, free: State) -> State:
 
 
 def _levy_area(solver: diffrax.AbstractSolver) -> type:
-    return getattr(solver, "minimal_levy_area", diffrax.BrownianIncrement)
+    """What a solver needs to know of the driving path."""
+    needed = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    area = issubclass(needed, diffrax.AbstractSpaceTimeLevyArea)
+    return diffrax.SpaceTimeLevyArea if area else diffrax.BrownianIncrement

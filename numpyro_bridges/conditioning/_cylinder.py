@@ -85,10 +85,10 @@ class CylinderSet(AbstractCondition):
     def _scan(self, mean: State, factor: Structured, choose, driver: State):
         """Coordinate after coordinate: its standardised interval, the value chosen in it, its log weight."""
         m = mean.shape[0]
-        lower, upper = (self.lower.astype(mean.dtype) - mean, self.upper.astype(mean.dtype) - mean)
+        lower, upper = self.lower.astype(mean.dtype), self.upper.astype(mean.dtype)
 
-        def one(low, high, z, scale):
-            low, high = low / scale, high / scale
+        def one(low, high, center, z, scale):
+            low, high = _standardise(low, center, scale), _standardise(high, center, scale)
             pinned = low == high
             w = jnp.where(pinned, low, choose(z, jnp.where(pinned, -1.0, low), jnp.where(pinned, 1.0, high)))
             chosen = log_interval_probability(low, high) + 0.5 * w * w + _LOG_SQRT_2PI + jnp.log(scale)
@@ -96,11 +96,10 @@ class CylinderSet(AbstractCondition):
 
         if factor.ndim < 2:
             d = jnp.broadcast_to(factor, (m,)) if mean.ndim == 1 else jnp.broadcast_to(factor, (m,))[:, None]
-            return one(lower, upper, driver, d)
+            return one(lower, upper, mean, driver, d)
 
         def step(w, i):
-            offset = factor[i] @ w
-            w_i, log_weight = one(lower[i] - offset, upper[i] - offset, driver[i], factor[i, i])
+            w_i, log_weight = one(lower[i], upper[i], mean[i] + factor[i] @ w, driver[i], factor[i, i])
             return w.at[i].set(w_i), log_weight
 
         return jax.lax.scan(step, jnp.zeros_like(mean), jnp.arange(m))
@@ -109,7 +108,7 @@ class CylinderSet(AbstractCondition):
         """In product form: coordinates independent given the state."""
         scale = law_factor if law_factor.ndim < 2 else jnp.linalg.norm(law_factor, axis=1)
         scale = scale[:, None] if scale.ndim and law_mean.ndim == 2 else scale
-        low, high = (self.lower - law_mean) / scale, (self.upper - law_mean) / scale
+        low, high = _standardise(self.lower, law_mean, scale), _standardise(self.upper, law_mean, scale)
         pinned = low == high
         density = -0.5 * low**2 - _LOG_SQRT_2PI - jnp.log(scale)
         inside = log_interval_probability(jnp.where(pinned, -1.0, low), jnp.where(pinned, 1.0, high))
@@ -128,12 +127,17 @@ class CylinderSet(AbstractCondition):
         factor = promote(law_factor, 2, m)
         w = jnp.linalg.solve(factor, seen - law_mean)
         scale = jnp.diagonal(factor) if seen.ndim == 1 else jnp.diagonal(factor)[:, None]
-        offset = factor @ w - scale * w
-        low = (self.lower - law_mean - offset) / scale
-        high = (self.upper - law_mean - offset) / scale
+        center = seen - scale * w
+        low, high = _standardise(self.lower, center, scale), _standardise(self.upper, center, scale)
         pinned = low == high
         z = truncated_quantile_inverse(w, jnp.where(pinned, -jnp.inf, low), jnp.where(pinned, jnp.inf, high))
         return z[None]
+
+
+def _standardise(bound: State, mean: State, scale: State) -> State:
+    """(bound − mean)/scale, with finite gradients where the bound is infinite."""
+    infinite = jnp.isinf(bound)
+    return jnp.where(infinite, bound, (jnp.where(infinite, 0.0, bound) - mean) / scale)
 
 
 class IntervalCensored(AbstractMatch):

@@ -106,7 +106,7 @@ class SpectralNoise(AbstractNoise):
         scale = jnp.sqrt(covariance.spectral_density(omega, dim) / period**dim)
         scale = jnp.concatenate([scale[:1], jnp.sqrt(2.0) * scale[1:]])
         phase = points @ omega.T
-        return jnp.concatenate([scale * jnp.cos(phase), (scale * jnp.sin(phase))[:, 1:]], axis=1)
+        return jnp.concatenate([scale[None] * jnp.cos(phase), (scale[None] * jnp.sin(phase))[:, 1:]], axis=1)
 
     def error(self, kernel, covariance, dim: int) -> dict[str, Array]:
         """What the representation leaves out, relative to a(x, x): the truncated `tail` (variance missing at a point)
@@ -152,7 +152,7 @@ class GridNoise(AbstractNoise):
         dim = points.shape[1]
         width = jnp.broadcast_to((self.upper - self.lower) / self.num_cells, (dim,))
         index = np.array(list(itertools.product(range(self.num_cells), repeat=dim)), float) + 0.5
-        cells = jnp.broadcast_to(self.lower, (dim,)) + jnp.asarray(index, points.dtype) * width
+        cells = jnp.broadcast_to(self.lower, (1, dim)) + jnp.asarray(index, points.dtype) * width[None]
         return kernel.matrix(points, cells) * jnp.sqrt(jnp.prod(width))
 
 
