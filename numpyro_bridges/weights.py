@@ -7,12 +7,14 @@ except to the mean, which it makes infinite.
 """
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+@partial(jax.jit, static_argnames="axis")
 def log_mean_exp(log_weights: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
     """Log of the mean weight, the estimate of a log evidence: log (1/S) Σ exp(log_weights).
 
@@ -27,6 +29,7 @@ def log_mean_exp(log_weights: Float[Array, "..."], axis: int = -1) -> Float[Arra
     return jax.nn.logsumexp(log_weights, axis=axis) - math.log(log_weights.shape[axis])
 
 
+@jax.jit
 def effective_sample_size(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
     """How many equally weighted particles the weights are worth (Kish): (Σ w)² / Σ w².
 
@@ -41,6 +44,7 @@ def effective_sample_size(log_weights: Float[Array, "... S"]) -> Float[Array, ".
     return jnp.sum(weights, axis=-1) ** 2 / jnp.where(squares == 0, 1.0, squares)
 
 
+@jax.jit
 def standard_error(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
     """Standard error of `log_mean_exp`, by the delta method: sd(w) / (mean(w) √S).
 

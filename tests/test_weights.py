@@ -62,7 +62,7 @@ def test_standard_error_is_the_spread_of_the_estimate():
 
 
 # where the two lines round the length of the tail alike
-@pytest.mark.parametrize("num_particles", [100, 400, 4096, 10_000])
+@pytest.mark.parametrize("num_particles", [100, 4096])
 @pytest.mark.parametrize("scale", [0.3, 3.0])
 @pytest.mark.parametrize("shift", SHIFTS)
 def test_pareto_k_is_arviz(key, num_particles, scale, shift):
