@@ -92,7 +92,7 @@ def pareto_k(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
 def pareto_k_threshold(num_particles: int) -> float:
     """The k̂ above which an estimate from so many particles is not to be relied on: min(1 − 1/log₁₀ S, 0.7).
 
-    **Source:** [@vehtari2024], equation 13.
+    **Source:** [@vehtari2024].
     """
     if num_particles < 2:
         raise ValueError(f"`num_particles` must be at least 2, got {num_particles}.")
