@@ -50,7 +50,7 @@ class _Seen(AbstractCondition):
         return self.match.observation(sde, x)
 
     def reference(self, sde, x):
-        return lift(self.match.operator, x, self.observed)
+        return lift(self.observation(sde, x).operator, x, self.observed)
 
     def log_value(self, law_mean, law_factor):
         return whitened_log_density(solve_lower(law_factor, self.observed - law_mean), law_factor)
