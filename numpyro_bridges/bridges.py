@@ -185,7 +185,7 @@ class GuidedBridge(eqx.Module):
         def drift_step(x, times):
             return x + (times[1] - times[0]) * self.sde.drift(times[0], x), None
 
-        if seen.operator.ndim:
+        if seen.operator.ndim or self.condition.num_extra_noises:  # part of the end state is open
             free, _ = jax.lax.scan(drift_step, free, (self.ts[:-1], self.ts[1:]))
         reference = self.condition.reference(self.sde, free)
         plan = self.guide.plan(self.sde, seen, reference, self.ts) if self._is_discrete else None
