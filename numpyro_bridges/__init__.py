@@ -1,6 +1,7 @@
 """Conditioned stochastic differential equations on function spaces as NumPyro likelihoods."""
 
 from . import datasets as datasets
+from . import infer as infer
 from . import io as io
 from . import plot as plot
 from .bridges import GuidedBridge as GuidedBridge
@@ -22,6 +23,15 @@ from .conditioning import (
 from .conditioning import (
     IntervalCensored as IntervalCensored,
 )
+from .distributions import (
+    DiffusionEndpoint as DiffusionEndpoint,
+)
+from .distributions import (
+    NoiseReparam as NoiseReparam,
+)
+from .distributions import (
+    sample as sample,
+)
 from .evidence import EvidenceEstimate as EvidenceEstimate
 from .evidence import estimate_evidence as estimate_evidence
 from .guiding import (
@@ -39,6 +49,7 @@ from .guiding import (
 from .guiding import (
     RecedingGuide as RecedingGuide,
 )
+from .infer import to_arviz as to_arviz
 from .kernels import (
     AbstractKernel as AbstractKernel,
 )

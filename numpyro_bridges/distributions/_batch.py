@@ -1,0 +1,104 @@
+"""All that concerns leading axes of a law.
+
+A law is made of parts, such as an SDE, a start and a match. Each part is shared by the whole batch, or *batched*: all
+its arrays carry the law's own batch axes in front, as `jax.vmap` of a constructor returns them. Plates widen the batch;
+what is written for one datum is mapped over it.
+"""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._checks import require
+from ..spaces import AbstractSpace
+
+
+@eqx.filter_jit
+def map_batch(one, shared, own, own_shape, batch_shape, arrays):
+    if not batch_shape:
+        return one(shared | own, *arrays)
+    own, static = eqx.partition(own, eqx.is_array)
+
+    def widened(a):
+        rest = a.shape[len(own_shape) :]
+        a = a.reshape((1,) * (len(batch_shape) - len(own_shape)) + a.shape)
+        return flat(jnp.broadcast_to(a, batch_shape + rest))
+
+    def flat(a):
+        return a.reshape((-1,) + a.shape[len(batch_shape) :])
+
+    def item(own, *items):
+        return one(shared | eqx.combine(own, static), *items)
+
+    out = jax.vmap(item)(jax.tree.map(widened, own), *map(flat, arrays))
+    return jax.tree.map(lambda a: a.reshape(batch_shape + a.shape[1:]), out)
+
+
+def one_of(parts, batched, own_shape, index):
+    """The parts of one law of the batch."""
+    index = tuple(i if n > 1 else 0 for i, n in zip(index[len(index) - len(own_shape) :], own_shape, strict=True))
+
+    def pick(part):
+        return jax.tree.map(lambda a: a[index] if eqx.is_array(a) else a, part)
+
+    return {name: pick(part) if name in batched else part for name, part in parts.items()}
+
+
+def find_batched(parts, batch_shape, declared, check) -> tuple[str, ...]:
+    """Names of the parts that carry the batch axes: as declared, or the one reading that `check` accepts."""
+    carriers = [name for name, part in parts.items() if batch_shape and _carries(part, batch_shape)]
+    if declared is not None:
+        for name in declared:
+            require(name in parts, f"`batched` must name parts among {sorted(parts)}; got {name!r}.")
+            require(name in carriers, f"every array of `{name}` must have {batch_shape} in front: it is in `batched`.")
+        readings = [tuple(declared)]
+    else:
+        readings = [r for k in range(len(carriers), -1, -1) for r in itertools.combinations(carriers, k)]
+    start = (0,) * len(batch_shape)
+    laws = {reading: one_of(parts, reading, batch_shape, start) for reading in readings}
+    fitting = [reading for reading, law in laws.items() if len(laws) == 1 or _accepts(check, law)]
+    for law in [laws[r] for r in fitting] or list(laws.values()):
+        _explained(check, law, batch_shape)
+    require(
+        len(fitting) == 1,
+        f"with `batch_shape={batch_shape}`, {' and '.join(carriers)} can be read with and without the batch axes. Say "
+        f"which parts carry them: `batched={fitting[0]}`, or `batched={fitting[-1]}`.",
+    )
+    return fitting[0]
+
+
+def _accepts(check, law) -> bool:
+    try:
+        check(law)
+    except Exception:  # a user's drift may raise anything at the wrong shape
+        return False
+    return True
+
+
+def _explained(check, law, batch_shape):
+    try:
+        check(law)
+    except TypeError as e:
+        raise ValueError(
+            f"the parts make neither one law nor a batch {batch_shape} of laws: {e} A parameter with an axis of its "
+            "own does it. Laws of a batch are built by `jax.vmap` of the constructors, and declared by `batch_shape`."
+        ) from e
+
+
+def _carries(part, batch_shape) -> bool:
+    arrays = [a for a in jax.tree.leaves(part) if eqx.is_array(a)]
+    return bool(arrays) and all(a.shape[: len(batch_shape)] == batch_shape for a in arrays)
+
+
+def parameters(part):
+    """Arrays that may be parameters; those of a space are not."""
+    leaves = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, AbstractSpace))
+    return [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
+
+
+def broadcasts(small, large) -> bool:
+    """Whether shape `small` broadcasts to shape `large`."""
+    padded = (1,) * (len(large) - len(small)) + tuple(small)
+    return len(padded) == len(large) and all(m in (1, n) for m, n in zip(padded, large, strict=True))

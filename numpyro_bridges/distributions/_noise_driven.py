@@ -1,0 +1,236 @@
+"""A NumPyro distribution of an observation whose density is that of a bridge, given standard normal noise."""
+
+import copy
+import math
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import numpyro.distributions as dist
+from numpyro.distributions import constraints
+
+from .._checks import concrete, require
+from ._batch import broadcasts, map_batch, one_of, parameters
+from ._driving_noise import DrivingNoise
+
+
+class AbstractNoiseDriven(dist.Distribution):
+    """The law of an observation. Its density given standard normal noise averages over the noise to that of `sample`.
+
+    A subclass says, for the parts of one law, how to simulate, how to weigh and what a datum must be.
+    """
+
+    arg_constraints = {}
+    pytree_data_fields = ("parts", "noise", "_mask")
+    pytree_aux_fields = ("_batched", "_declared", "_own_shape", "_noise_shape", "_moved")
+
+    def __init__(self, parts, batched, declared, batch_shape, event_shape, noise_shape, validate_args=None):
+        self.parts, self.noise, self._mask = parts, None, None
+        self._batched, self._declared = batched, declared
+        self._own_shape, self._noise_shape, self._moved = batch_shape, noise_shape, 0
+        super().__init__(batch_shape, event_shape, validate_args=validate_args)
+        self._refuse_hidden_axes(batch_shape)
+
+    @staticmethod
+    def _simulate(parts, key):
+        """An observation and the noise with which a bridge to it follows the simulated path."""
+        raise NotImplementedError
+
+    @staticmethod
+    def _observe(parts, key):
+        """An observation."""
+        raise NotImplementedError
+
+    @staticmethod
+    def _log_weight(parts, value, noise):
+        """log p(value | noise), which integrates over the noise."""
+        raise NotImplementedError
+
+    @staticmethod
+    def _placeholder(parts, value):
+        """A datum like `value` that is harmless, where the real one is masked."""
+        raise NotImplementedError
+
+    @staticmethod
+    def _check_data(parts, values):
+        """`ValueError` if one of the values, a leading axis of them, cannot be observed."""
+        raise NotImplementedError
+
+    @property
+    def has_rsample(self):
+        """`False`: what asks for it is a variational guide, and a law whose density needs the noise cannot be one."""
+        return False
+
+    @property
+    def support(self):
+        return constraints.independent(constraints.real, self.event_dim)
+
+    def noise_prior(self) -> DrivingNoise:
+        """The prior of the noise, N(0, I), one noise for each datum of the batch."""
+        return DrivingNoise(self.batch_shape, self.event_shape[: self._moved] + self._noise_shape)
+
+    def given(self, noise):
+        """The same law with its noise bound, so that it has a `log_prob`. Leading axes of the noise widen the batch."""
+        event = self.event_shape[: self._moved] + self._noise_shape
+        noise = jnp.asarray(noise)
+        k = noise.ndim - len(event)
+        require(
+            k >= 0 and noise.shape[k:] == event,
+            f"`noise` must have shape (..., {', '.join(map(str, event))}), one for each datum; got {noise.shape}.",
+        )
+        require(
+            broadcasts(self.batch_shape, noise.shape[:k]),
+            f"`noise` must have one noise for each datum, batch shape {self.batch_shape}; got {noise.shape[:k]}. "
+            "Draw it from `law.noise_prior()`, inside the same plates as the data.",
+        )
+        return self._replace(noise=None)._widened(noise.shape[: noise.ndim - 3])._replace(noise=noise)
+
+    def sample(self, key, sample_shape=()):
+        """Observations of the unconditioned process. The bound noise, which belongs to a datum, plays no part."""
+        return self._over_batch(self._observe, *self._keys(key, sample_shape))
+
+    def sample_with_noise(self, key, sample_shape=()):
+        """Joint draws (v, z): with v from `sample`, z the noise by which the bridge to v retraces the simulated path.
+
+        They have density `exp(noise_prior().log_prob(z) + given(z).log_prob(v))`. To draw z from its prior and then v
+        gives the same margins and the wrong joint law.
+        """
+        return self._over_batch(self._simulate, *self._keys(key, sample_shape))
+
+    def log_prob(self, value, intermediates=None):
+        """log p(value | noise). Its exponential averages over the noise to the density of `sample`.
+
+        It is no density of `value` at fixed noise. Where the law is masked it is 0, whatever the value, NaN included.
+        """
+        self._check_value(value)
+        require(
+            self.noise is not None,
+            f"the noise site is missing: {type(self).__name__} has a density only with its noise bound. Use "
+            "`numpyro_bridges.sample(name, law, obs=...)`, the handler `NoiseReparam`, or `law.given(noise)`.",
+        )
+        full, mask = self._full_shape, self._mask
+        if mask is not None and not np.any(concrete(mask) if concrete(mask) is not None else True):
+            return jnp.zeros(self.batch_shape)
+        value = jnp.broadcast_to(value, self.shape())
+        if mask is not None:
+            hidden = ~mask.reshape(mask.shape + (1,) * (value.ndim - mask.ndim))
+            value = jnp.where(hidden, self._over_batch(self._placeholder, full, value), value)
+        log_prob = self._over_batch(self._log_weight, full, value, self.noise)
+        log_prob = jnp.where(True if mask is None else mask, log_prob, 0.0)
+        return jnp.sum(log_prob, axis=tuple(range(-self._moved, 0)))
+
+    def expand(self, batch_shape):
+        return self._widened(tuple(batch_shape) + self.event_shape[: self._moved])
+
+    def mask(self, mask):
+        if mask is True:
+            return self
+        mask = jnp.asarray(mask, bool)
+        law = self.expand(jnp.broadcast_shapes(mask.shape, self.batch_shape))
+        mask = jnp.broadcast_to(mask, law.batch_shape)
+        mask = jnp.broadcast_to(mask.reshape(mask.shape + (1,) * law._moved), law._full_shape)
+        return law._replace(_mask=mask if law._mask is None else mask & law._mask)
+
+    def to_event(self, reinterpreted_batch_ndims=None):
+        n = len(self.batch_shape)
+        k = n if reinterpreted_batch_ndims is None else reinterpreted_batch_ndims
+        require(0 <= k <= n, f"`reinterpreted_batch_ndims` must be at most {n}, the number of batch axes; got {k}.")
+        batch, moved = self.batch_shape[: n - k], self.batch_shape[n - k :]
+        return self._replace(_batch_shape=batch, _event_shape=moved + self.event_shape, _moved=self._moved + k)
+
+    def _replace(self, **fields):
+        law = copy.copy(self)
+        for name, value in fields.items():
+            setattr(law, name, value)
+        return law
+
+    @property
+    def _full_shape(self):
+        """The batch, axes that `to_event` has moved included."""
+        return self.batch_shape + self.event_shape[: self._moved]
+
+    def _widened(self, full):
+        old = self._full_shape
+        if full == old:
+            return self
+        require(broadcasts(old, full), f"a law of batch shape {old} cannot be expanded to {full}.")
+        self._refuse_hidden_axes(full)
+        noise, mask = self.noise, self._mask
+        if noise is not None:
+            require(
+                math.prod(old) == math.prod(full),
+                f"the law has {math.prod(old)} noise(s), batch shape {old}, and is expanded to {full}. One noise "
+                "shared by several data is a wrong likelihood: draw it inside the same plates, or use "
+                "`numpyro_bridges.sample`.",
+            )
+            noise = noise.reshape(full + self._noise_shape)
+        mask = mask if mask is None else jnp.broadcast_to(mask, full)
+        return self._replace(_batch_shape=full[: len(full) - self._moved], noise=noise, _mask=mask)
+
+    def _refuse_hidden_axes(self, full):
+        """A shared part with an axis as long as one of the batch may be a parameter drawn inside the plate."""
+        if self._declared:
+            return
+        sizes = set(full) - {1}
+        for name in {"sde", "match"} & set(self.parts) - set(self._batched):
+            for leaf in parameters(self.parts[name]):
+                require(
+                    leaf.ndim == 0 or leaf.shape[0] not in sizes,
+                    f"`{name}` holds an array of shape {leaf.shape} and is used in a batch {full}. A parameter drawn "
+                    f"inside the plate would be broadcast into the state: build one `{name}` for each datum by "
+                    "`jax.vmap`, and give `batch_shape`. If the array belongs to every datum, say `batched=()`.",
+                )
+
+    def _keys(self, key, sample_shape):
+        shape = tuple(sample_shape) + self._full_shape
+        return shape, jr.split(key, shape)
+
+    def _over_batch(self, one, batch_shape, *arrays):
+        """`one(parts, *items)` for every item of the batch, results with the batch axes in front."""
+        own = {name: self.parts[name] for name in self._batched}
+        shared = {name: part for name, part in self.parts.items() if name not in own}
+        return map_batch(one, shared, own, self._own_shape, batch_shape, arrays)
+
+    def _check_value(self, value):
+        shape = jnp.shape(value)
+        k = len(shape) - self.event_dim
+        require(
+            k >= 0 and shape[k:] == self.event_shape,
+            f"an observation must have shape {self.event_shape}, behind a batch {self.batch_shape}; got {shape}.",
+        )
+        require(
+            broadcasts(shape[:k], self.batch_shape),
+            f"{math.prod(shape[:k])} observations, batch shape {shape[:k]}, for a law of batch {self.batch_shape}. "
+            "One noise shared by several data is a wrong likelihood: put the site into a plate.",
+        )
+        data, mask = concrete(value), True if self._mask is None else concrete(self._mask)
+        if data is not None and mask is not None:
+            full = shape[: k + self._moved] if mask is True else self._full_shape
+            data = np.broadcast_to(data, full + self.event_shape[self._moved :])
+            with jax.ensure_compile_time_eval():
+                self._check_seen(data, np.broadcast_to(mask, full))
+
+    def _check_seen(self, data, seen):
+        """All data at once; one after the other to name the one that is wrong, or where each has its own law."""
+        if not seen.any() or not self._batched and _passes(self._check_data, self.parts, data[seen]):
+            return
+        for index in map(tuple, np.argwhere(seen)):
+            own = index[max(len(index) - len(self._own_shape), 0) :]
+            own = (0,) * (len(self._own_shape) - len(own)) + own
+            try:
+                self._check_data(one_of(self.parts, self._batched, self._own_shape, own), data[index][None])
+            except ValueError as e:
+                raise ValueError(f"datum {tuple(map(int, index))}: {e}" if index else str(e)) from e
+
+    def _validate_sample(self, value):
+        self._check_value(value)
+        return jnp.ones((), bool)
+
+
+def _passes(check, *args) -> bool:
+    try:
+        check(*args)
+    except ValueError:
+        return False
+    return True
