@@ -46,17 +46,19 @@ def add(A: Structured, B: Structured) -> Structured:
     """A + B."""
     if A.ndim < B.ndim:
         A, B = B, A
-    if A.ndim == 2 and B.ndim < 2:
-        i = jnp.arange(A.shape[0])
-        return A.at[i, i].add(B)
-    return A + B
+    return A + diagonal_matrix(B, A.shape[0]) if A.ndim == 2 and B.ndim < 2 else A + B
+
+
+def diagonal_matrix(d: Structured, n: int) -> Structured:
+    """A scalar or diagonal as an n × n matrix; elementwise, where a scatter would be a loop."""
+    return jnp.where(jnp.eye(n, dtype=bool), d if d.ndim == 0 else d[:, None], 0.0)
 
 
 def promote(A: Structured, ndim: int, n: int) -> Structured:
     """The same map with at least the given rank, `n` being the size of the state."""
     if A.ndim == 0 and ndim >= 1:
         A = jnp.full((n,), A)
-    return jnp.diag(A) if A.ndim == 1 and ndim == 2 else A
+    return diagonal_matrix(A, n) if A.ndim == 1 and ndim == 2 else A
 
 
 def cholesky(S: Structured) -> Structured:
@@ -68,8 +70,7 @@ def solve_lower(C: Structured, x: State, transposed: bool = False) -> State:
     """C⁻¹ x, or C⁻ᵀ x, for a lower triangular C."""
     if C.ndim < 2:
         return x / (C if C.ndim == 0 else _rows(C, x))
-    columns = x if x.ndim == 2 else x[:, None]
-    out = lax.linalg.triangular_solve(C, columns, left_side=True, lower=True, transpose_a=transposed)
+    out = lax.linalg.triangular_solve(C, as_columns(x), left_side=True, lower=True, transpose_a=transposed)
     return out.reshape(x.shape)
 
 
@@ -78,6 +79,11 @@ def log_diagonal(C: Structured, m: int):
     if C.ndim == 0:
         return m * jnp.log(C)
     return jnp.sum(jnp.log(C if C.ndim == 1 else jnp.diagonal(C)))
+
+
+def as_columns(x: State) -> State:
+    """A vector state as a matrix of one column."""
+    return x if x.ndim == 2 else x[:, None]
 
 
 def columns(x: State) -> int:

@@ -1,5 +1,7 @@
 """Guided bridges: an SDE conditioned on what is seen at a later time, as a function of standard normal noise."""
 
+import functools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -24,6 +26,10 @@ from .guiding import (
     weight_rate,
 )
 from .sdes import AbstractSDE, Transition
+
+
+_MAX_KEPT = 128
+"""Largest n whose Cholesky factors, three n × n matrices a step, are kept for the reverse pass and not computed again."""
 
 
 class GuidedBridge(eqx.Module):
@@ -234,7 +240,7 @@ class GuidedBridge(eqx.Module):
         return jnp.concatenate([self.x0[None], path]), log_weight + target.log_weight
 
     def _run_discrete(self, noise, seen, plan, target, start):
-        @jax.checkpoint
+        @functools.partial(jax.checkpoint, prevent_cse=False, policy=_kept(self.x0))
         def step(y, inputs):
             t0, t1, z, planned = inputs
             control = GridNoise(jnp.stack([t0, t1]), z[None])
@@ -245,14 +251,14 @@ class GuidedBridge(eqx.Module):
         planned = jax.tree.map(lambda a: a[1:], plan.steps)
         (x, log_weight), path = jax.lax.scan(step, start, (self.ts[:-2], self.ts[1:-1], noise[:-1], planned))
         transition, steering = self._last_step(x, seen, target)
-        x = transition.mean + apply(transition.factor, steering.forward(noise[-1]))
+        x = transition.mean + apply(transition.factor, steering.drive(noise[-1])[0])
         return jnp.concatenate([path, x[None]]), log_weight + steering.log_evidence() + seen.log_scale
 
     def _last_step(self, x, seen, target):
         """The step onto the observation itself: exact whatever guides."""
         transition = self.sde.transition(self.ts[-2], self.ts[-1], x)
         zero = jnp.zeros_like(target.value)
-        return transition, GaussianSteering(transition, seen.operator, zero, seen.covariance, seen.factor, target.value)
+        return transition, GaussianSteering(transition, seen.operator, zero, seen.covariance, target.value)
 
     def _run_continuous(self, noise, seen, reference, target, start):
         t_end = self.ts[-1]
@@ -278,7 +284,7 @@ class GuidedBridge(eqx.Module):
             log_weight = log_weight + (t_end - self.ts[-2]) * rate
             transition, steering = self._last_step(x, seen, target)
             k = self.sde.noise_size(self.x0)
-            x = transition.mean + apply(transition.factor, steering.forward(noise[-1][:k]))
+            x = transition.mean + apply(transition.factor, steering.drive(noise[-1][:k])[0])
             path = jnp.concatenate([path, x[None]])
         return path, log_weight
 
@@ -350,6 +356,10 @@ def time_grid(
     )
     t0, t1 = as_float(t0, "t0"), as_float(t1, "t1")
     require(
+        t0.ndim == 0 and t1.ndim == 0,
+        f"`t0` and `t1` must be one time each; got shapes {t0.shape} and {t1.shape}. Use vmap for a batch.",
+    )
+    require(
         jnp.isfinite(t0) & jnp.isfinite(t1) & (t1 > t0),
         f"`t1` must be finite and later than `t0`; got t0 = {t0}, t1 = {t1}.",
     )
@@ -367,6 +377,12 @@ def _driving_noise(transition: Transition, x: State, free: State) -> State:
         return jnp.linalg.solve(factor, d)
     pseudo_inverse = jnp.linalg.pinv(factor)
     return pseudo_inverse @ (d - factor @ free) + free
+
+
+def _kept(x0: State):
+    """What the reverse pass keeps of a step: its Cholesky factors, unless they would fill the memory."""
+    few = x0.shape[0] <= _MAX_KEPT
+    return lambda primitive, *_, **__: few and primitive.name == "cholesky"
 
 
 def _levy_area(solver: diffrax.AbstractSolver) -> type:

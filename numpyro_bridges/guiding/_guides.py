@@ -57,15 +57,14 @@ class AbstractGuide(eqx.Module):
 
 
 class _FrozenPlan(AbstractPlan):
-    steps: tuple[Structured, State, Structured, Structured]
+    steps: tuple[Structured, State, Structured]
 
     def steer(self, step, transition, dt, x, observed):
-        operator, shift, covariance, factor = step
-        return GaussianSteering(transition, operator, shift, covariance, factor, observed)
+        return GaussianSteering(transition, *step, observed)
 
     def message(self, step, sde, t, x, observed):
-        operator, shift, _, factor = step
-        return GaussianMessage(operator, shift, factor, observed, jnp.zeros((), x.dtype))
+        operator, shift, covariance = step
+        return GaussianMessage(operator, shift, cholesky(covariance), observed, jnp.zeros((), x.dtype))
 
 
 class FrozenGuide(AbstractGuide):
@@ -111,14 +110,14 @@ class _RecedingPlan(AbstractPlan):
         flow, shift, kappa = step
         a = (1 - self.end_weight) * a + self.end_weight * self.end_covariance
         covariance = add(self.noise, congruence(self.operator, _accumulated(kappa, a)))
-        return compose(self.operator, flow), shift, covariance, cholesky(covariance)
+        return compose(self.operator, flow), shift, covariance
 
     def steer(self, step, transition, dt, x, observed):
         return GaussianSteering(transition, *self._forecast(step, transition.covariance / dt), observed)
 
     def message(self, step, sde, t, x, observed):
-        operator, shift, _, factor = self._forecast(step, sde.covariance(t, x))
-        return GaussianMessage(operator, shift, factor, observed, jnp.zeros((), x.dtype))
+        operator, shift, covariance = self._forecast(step, sde.covariance(t, x))
+        return GaussianMessage(operator, shift, cholesky(covariance), observed, jnp.zeros((), x.dtype))
 
 
 class RecedingGuide(AbstractGuide):
@@ -193,8 +192,8 @@ class _DriftPlan(AbstractPlan):
         return self.wrapped.message(step, sde, t, x, observed)
 
 
-def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, State, Structured, Structured]:
-    """Λ_k, s_k, M_k and a lower factor of M_k at every grid time but the last, leading axis k."""
+def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, State, Structured]:
+    """Λ_k, s_k and M_k at every grid time but the last, leading axis k."""
     first = jax.tree.map(lambda a: a[0], steps)
     n = first.shift.shape[0]
     start = (seen.operator, jnp.zeros_like(apply(seen.operator, first.shift)))
@@ -211,8 +210,7 @@ def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, S
     shapes = jax.eval_shape(lambda s: back(s, first)[0], shapes)
     operator = promote(seen.operator, len(shapes[0].shape), n)
     carry = (operator, start[1], promote(M, len(shapes[2].shape), start[1].shape[0]))
-    _, (operator, shift, M) = jax.lax.scan(back, carry, steps, reverse=True)
-    return operator, shift, M, jax.vmap(cholesky)(M)
+    return jax.lax.scan(back, carry, steps, reverse=True)[1]
 
 
 def _square(flow: Structured) -> Structured:

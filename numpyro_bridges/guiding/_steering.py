@@ -21,10 +21,22 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import add, apply, cholesky, columns, compose, congruence, log_diagonal, solve_lower, transpose
+from .._linalg import (
+    add,
+    apply,
+    as_columns,
+    cholesky,
+    columns,
+    compose,
+    congruence,
+    log_diagonal,
+    solve_lower,
+    transpose,
+)
 from .._types import Noise, State, Structured
 from ..conditioning import whitened_log_density
 from ..sdes import Transition
+from ._drive import drive
 
 
 class AbstractSteering(eqx.Module):
@@ -35,29 +47,26 @@ class AbstractSteering(eqx.Module):
         """μ."""
 
     @abc.abstractmethod
-    def forward(self, z: Noise) -> Noise:
-        """The driving noise u."""
+    def drive(self, z: Noise) -> tuple[Noise, Float[Array, ""]]:
+        """The driving noise u and the log weight of the step."""
 
     @abc.abstractmethod
     def inverse(self, u: Noise) -> Noise:
         """The z that gives u; where an exact observation leaves part of z without effect, that part is 0."""
 
-    @abc.abstractmethod
-    def log_det(self, z: Noise) -> Float[Array, ""]:
-        """log|B| over all columns of z."""
 
-    def log_ratio(self, z: Noise, u: Noise) -> Float[Array, ""]:
-        """log p(u)/q(u), the log weight of the step."""
-        return 0.5 * (jnp.sum(z * z) - jnp.sum(u * u)) + self.log_det(z)
+def log_ratio(z: Noise, u: Noise) -> Float[Array, ""]:
+    """log N(u; 0, I) − log N(z; 0, I)."""
+    return 0.5 * (jnp.sum(z * z) - jnp.sum(u * u))
 
 
 class GaussianSteering(AbstractSteering):
-    """The conditional law of the noise given a Gaussian observation of the next state."""
+    """The conditional law of the noise given v ~ N(operator x' + shift, covariance); covariance None is exact."""
 
     A: Structured
-    N: Structured
-    P: Structured | None
-    y: State
+    S: Structured
+    M: Structured | None
+    r: State
 
     def __init__(
         self,
@@ -65,47 +74,54 @@ class GaussianSteering(AbstractSteering):
         operator: Structured,
         shift: State,
         covariance: Structured | None,
-        factor: Structured | None,
         observed: State,
     ):
-        """The observation is N(operator x' + shift, covariance), covariance = factor factorᵀ; an exact one has factor None."""
         S = congruence(operator, transition.covariance)
         self.A = compose(operator, transition.factor)
-        self.N = cholesky(S if covariance is None else add(covariance, S))
-        self.P = factor
-        self.y = solve_lower(self.N, observed - shift - apply(operator, transition.mean))
+        self.S = S if covariance is None else add(covariance, S)
+        self.M = covariance
+        self.r = observed - shift - apply(operator, transition.mean)
 
-    @property
-    def _sum(self) -> Structured:
-        return self.N if self.P is None else add(self.N, self.P)
+    def _factors(self) -> tuple[Structured, Structured, State]:
+        """N, N + P and y."""
+        N = cholesky(self.S)
+        return N, N if self.M is None else add(N, cholesky(self.M)), solve_lower(N, self.r)
 
-    def _lift(self, y: State, C: Structured) -> Noise:
+    def _lift(self, C: Structured, y: State) -> Noise:
         return apply(transpose(self.A), solve_lower(C, y, transposed=True))
 
     def mean(self):
-        return self._lift(self.y, self.N)
+        N, _, y = self._factors()
+        return self._lift(N, y)
 
-    def forward(self, z):
-        return z + self._lift(self.y - solve_lower(self._sum, apply(self.A, z)), self.N)
+    def drive(self, z):
+        if self.M is not None and self.A.ndim == self.S.ndim == self.M.ndim == 2:
+            u, log_det = drive(self.A, self.S, self.M, as_columns(self.r), as_columns(z))
+            u = u.reshape(z.shape)
+        else:
+            N, total, y = self._factors()
+            u = z + self._lift(N, y - solve_lower(total, apply(self.A, z)))
+            m = self.r.shape[0]
+            log_det = -jnp.inf if self.M is None else log_diagonal(cholesky(self.M), m) - log_diagonal(N, m)
+        return u, log_ratio(z, u) + columns(z) * log_det
 
     def inverse(self, u):
-        u = u - self.mean()
+        N, total, y = self._factors()
+        u = u - self._lift(N, y)
         Au = apply(self.A, u)
-        if self.P is None:
-            return u - self._lift(solve_lower(self.N, Au), self.N)
-        return u + self._lift(solve_lower(self.P, Au), self._sum)
+        if self.M is None:
+            return u - self._lift(N, solve_lower(N, Au))
+        return u + self._lift(total, solve_lower(cholesky(self.M), Au))
 
     def without_effect(self, z: Noise) -> Noise:
         """The part of z that an exact observation leaves without effect."""
-        return self._lift(solve_lower(self.N, apply(self.A, z)), self.N)
-
-    def log_det(self, z):
-        m, dim = self.y.shape[0], columns(self.y)
-        return dim * (log_diagonal(self.P, m) - log_diagonal(self.N, m))
+        N = cholesky(self.S)
+        return self._lift(N, solve_lower(N, apply(self.A, z)))
 
     def log_evidence(self) -> Float[Array, ""]:
         """log density of the observation given the present state: what the last step weighs."""
-        return whitened_log_density(self.y, self.N)
+        N, _, y = self._factors()
+        return whitened_log_density(y, N)
 
 
 class DriftSteering(AbstractSteering):
@@ -116,11 +132,9 @@ class DriftSteering(AbstractSteering):
     def mean(self):
         return self.shift
 
-    def forward(self, z):
-        return z + self.shift
+    def drive(self, z):
+        u = z + self.shift
+        return u, log_ratio(z, u)
 
     def inverse(self, u):
         return u - self.shift
-
-    def log_det(self, z):
-        return jnp.zeros((), z.dtype)

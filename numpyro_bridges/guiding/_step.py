@@ -95,8 +95,8 @@ class GuidedStep(diffrax.AbstractItoSolver):
         transition = terms.sde.transition(t0, t1, x)
         steering = terms.plan.steer(terms.step(t0), transition, t1 - t0, x, terms.observed)
         z = terms.contr(t0, t1)
-        u = steering.forward(z)
-        y1 = (transition.mean + apply(transition.factor, u), log_weight + steering.log_ratio(z, u))
+        u, step_weight = steering.drive(z)
+        y1 = (transition.mean + apply(transition.factor, u), log_weight + step_weight)
         return y1, None, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
 
     def func(self, terms, t0, y0, args):

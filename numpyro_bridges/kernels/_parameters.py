@@ -57,7 +57,8 @@ def squared_distances(x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Flo
         x.shape[1] == y.shape[1],
         f"`x` and `y` must hold points of one dimension; got shapes {x.shape} and {y.shape}.",
     )
-    return jnp.sum(jnp.square(x[:, None, :] - y[None, :, :]), axis=-1)
+    # one coordinate at a time: whole n × m arrays, and a derivative with none of shape (n, m, dim)
+    return sum(jnp.square(a[:, None] - b[None, :]) for a, b in zip(x.T, y.T, strict=True))
 
 
 def squared_frequency(omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:

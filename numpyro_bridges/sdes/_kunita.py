@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._checks import concrete, require
-from .._linalg import compose, transpose
 from .._types import RealScalar, State, Structured
 from ..kernels import AbstractKernel
 from ..spaces import AbstractSpace, Landmarks
@@ -65,11 +64,11 @@ class KunitaFlow(AbstractSDE):
         return jnp.zeros_like(x)
 
     def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
-        points = self.space.to_points(x)
-        sigma = self.space.from_points(self.noise_field.factor(self.kernel, self.covariance_kernel, points))
-        if isinstance(self.noise_field, LandmarkNoise):
-            return sigma, self.noise_field.matrix(self.covariance_kernel, points)
-        return sigma, compose(sigma, transpose(sigma))
+        sigma, a = self.noise_field.factor_and_covariance(self.kernel, self.covariance_kernel, self.space.to_points(x))
+        if isinstance(self.space, Landmarks):
+            return sigma, a
+        sigma = self.space.from_points(sigma)
+        return sigma, sigma @ sigma.T
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         return jnp.zeros((), x.dtype), jnp.zeros_like(x)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import as_float, require, require_finite, require_positive
-from .._linalg import cholesky
+from .._linalg import add, cholesky
 from ..kernels import AbstractKernel
 
 
@@ -30,6 +30,11 @@ class AbstractNoise(eqx.Module):
     ) -> Float[Array, "q k"]:
         """σ at the points, one column per driving noise."""
 
+    def factor_and_covariance(self, kernel, covariance, points) -> tuple[Float[Array, "q k"], Float[Array, "q q"]]:
+        """σ and σσᵀ at the points."""
+        sigma = self.factor(kernel, covariance, points)
+        return sigma, sigma @ sigma.T
+
 
 class LandmarkNoise(AbstractNoise):
     """Noise attached to the landmarks: the Cholesky factor of their covariance, n noises per coordinate.
@@ -44,17 +49,16 @@ class LandmarkNoise(AbstractNoise):
     def __init__(self, jitter=None):
         self.jitter = None if jitter is None else as_float(jitter, "jitter")
 
-    def matrix(self, covariance: AbstractKernel, points: Float[Array, "n d"]) -> Float[Array, "n n"]:
-        """The covariance of the points with its jitter: the one place where it is added."""
+    def factor(self, kernel, covariance, points):
+        return self.factor_and_covariance(kernel, covariance, points)[0]
+
+    def factor_and_covariance(self, kernel, covariance, points):
         K = covariance.matrix(points, points)
         jitter = self.jitter
         if jitter is None:
-            jitter = 1e-5 if K.dtype == jnp.float32 else 1e-10
-        i = jnp.arange(K.shape[0])
-        return K.at[i, i].add(jitter * K[0, 0])
-
-    def factor(self, kernel, covariance, points):
-        return cholesky(self.matrix(covariance, points))
+            jitter = jnp.asarray(1e-5 if K.dtype == jnp.float32 else 1e-10, K.dtype)
+        K = add(K, jitter.astype(K.dtype) * covariance.variance.astype(K.dtype))
+        return cholesky(K), K
 
 
 class SpectralNoise(AbstractNoise):
