@@ -372,9 +372,8 @@ def _driving_noise(transition: Transition, x: State, free: State) -> State:
     d = x - transition.mean
     factor = transition.factor
     if factor.ndim < 2:
-        return d / (factor if factor.ndim == 0 or d.ndim == 1 else factor[:, None])
-    if factor.shape[0] == factor.shape[1]:
-        return jnp.linalg.solve(factor, d)
+        factor = factor if factor.ndim == 0 or d.ndim == 1 else factor[:, None]
+        return jnp.where(factor == 0, free, d / jnp.where(factor == 0, 1.0, factor))
     pseudo_inverse = jnp.linalg.pinv(factor)
     return pseudo_inverse @ (d - factor @ free) + free
 
