@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._checks import as_float, concrete, require, require_finite
@@ -351,7 +352,7 @@ def time_grid(
         return ts
     require(t1 is not None and num_steps is not None, "Give `t1` and `num_steps`, or a grid `ts`.")
     require(
-        isinstance(num_steps, int) and not isinstance(num_steps, bool) and num_steps >= 1,
+        isinstance(num_steps, (int, np.integer)) and not isinstance(num_steps, bool) and num_steps >= 1,
         f"`num_steps` must be a positive integer; got {num_steps!r}.",
     )
     t0, t1 = as_float(t0, "t0"), as_float(t1, "t1")
@@ -363,7 +364,7 @@ def time_grid(
         jnp.isfinite(t0) & jnp.isfinite(t1) & (t1 > t0),
         f"`t1` must be finite and later than `t0`; got t0 = {t0}, t1 = {t1}.",
     )
-    s = jnp.linspace(0.0, 1.0, num_steps + 1)
+    s = jnp.linspace(0.0, 1.0, int(num_steps) + 1)
     return t0 + (t1 - t0) * (s * (2 - s) if graded else s)
 
 
