@@ -176,10 +176,10 @@ class GuidedBridge(eqx.Module):
     def _split(self, noise):
         """Rows that choose the target, rows that drive the steps; columns dropped for vector states."""
         require(
-            noise.shape == self.noise_shape,
-            f"`noise` must have shape {self.noise_shape}, one noise for one path; got {noise.shape}. Use vmap for a batch.",
+            jnp.shape(noise) == self.noise_shape,
+            f"`noise` must have shape {self.noise_shape}, one noise for one path; got {jnp.shape(noise)}. Use vmap for a batch.",
         )
-        noise = noise.astype(self.x0.dtype)
+        noise = as_float(noise, "noise").astype(self.x0.dtype)
         noise = noise[..., 0] if self.x0.ndim == 1 else noise
         extra = self.condition.num_extra_noises
         return noise[:extra], noise[extra:]
@@ -216,12 +216,14 @@ class GuidedBridge(eqx.Module):
 
     def log_h(self, t: RealScalar, x: State) -> Float[Array, ""]:
         """log h̃(t, x) of the guide, t before t1: the log density of the datum, or log probability of the set, from x."""
+        x = as_float(x, "x")
         seen = self.condition.observation(self.sde, x)
         message = self._message(t, x, jnp.zeros_like(apply(seen.operator, x)))
         return self.condition.log_value(apply(message.operator, x) + message.shift, message.factor) + seen.log_scale
 
     def score(self, t: RealScalar, x: State) -> State:
         """∇ log h̃(t, x), the guide's covariance held fixed: where the path is pulled, before a(x) acts on it."""
+        x = as_float(x, "x")
         seen = self.condition.observation(self.sde, x)
         message = self._message(t, x, jnp.zeros_like(apply(seen.operator, x)))
         return jax.grad(lambda y: self.condition.log_value(apply(message.operator, y) + message.shift, message.factor))(

@@ -1,0 +1,137 @@
+"""How good is a guide? Spread of the log weight, evidence and time, for each guide on simulated, real and small cases.
+
+    python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing cell gbm]
+
+One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard error, ESS in percent, k̂ with
+the threshold above which the evidence is not to be trusted, seconds of a run without compilation, and seconds per effective
+particle. `reference` is a log evidence from elsewhere: a closed form, or a long run. All in double precision.
+
+The simulated Kunita cases are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or `../shared/data`.
+"""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+import numpyro_bridges as nb
+
+GUIDES = {
+    "FrozenGuide()": (nb.FrozenGuide(), None),
+    "RecedingGuide()": (nb.RecedingGuide(), None),
+    "RecedingGuide(0.2)": (nb.RecedingGuide(0.2), None),
+    "DriftGuide(RecedingGuide())": (nb.DriftGuide(nb.RecedingGuide()), None),
+    "FrozenGuide(), continuous Euler weight": (nb.FrozenGuide(), diffrax.Euler()),
+}
+CONSTANT = {
+    "FrozenGuide()": (nb.FrozenGuide(), None),
+    "FrozenGuide(BrownianMotion)": (nb.FrozenGuide(nb.BrownianMotion(0.01)), None),
+    "DriftGuide(FrozenGuide())": (nb.DriftGuide(nb.FrozenGuide()), None),
+    "FrozenGuide(), continuous Euler weight": (nb.FrozenGuide(), diffrax.Euler()),
+}
+
+
+def kunita():
+    """Three simulated end states of a strongly nonlinear flow: 16 landmarks, observation SD 0.032."""
+    folder = Path(os.environ.get("NUMPYRO_BRIDGES_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    file = folder / "kunita_cases" / "kunita_cases.npz"
+    if not file.is_file():
+        print(json.dumps({"case": "kunita", "skipped": f"no {file}: set NUMPYRO_BRIDGES_DATA"}))
+        return
+    data = np.load(file)
+    space = nb.Landmarks(16, 2, weights=1.0)
+    flow = nb.KunitaFlow(space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5))
+    match = nb.InexactMatch(1e-3)
+    for i, (target, reference) in enumerate(zip(data["edge_targets"], (24.75, 16.40, 9.65), strict=True)):
+        setting = dict(sde=flow, condition=match.at(target), x0=data["root"], t1=1.0, num_steps=100)
+        yield f"kunita {i}", setting, reference, GUIDES
+
+
+def wing():
+    """From one wing of a genus to another: 32 points, observation SD 0.005 per point coordinate."""
+    wings = nb.datasets.mosquito_wings(32, "CX")
+    space = nb.Landmarks(32, 2)
+    flow = nb.KunitaFlow(space, nb.GaussianKernel(0.1, 0.4))
+    match = nb.InexactMatch.from_point_sd(0.005, space)
+    setting = dict(sde=flow, condition=match.at(wings.points[1]), x0=wings.points[0], t1=1.0, num_steps=50)
+    yield "wing", setting, None, GUIDES
+
+
+def cell():
+    """A bistable drift, constant noise, exact end; the reference is for 400 uniform Euler steps."""
+
+    def u(y):
+        return y**4 / (1 / 16 + y**4)
+
+    def drift(t, x, args):
+        a, b = u(x)
+        return jnp.stack([a + 1 - b, b + 1 - a]) - x
+
+    sde = nb.SDE(drift, lambda t, x, args: 0.1)
+    ts = np.linspace(0.0, 4.0, 401)
+    setting = dict(sde=sde, condition=nb.ExactMatch().at([2.0, -0.1]), x0=[0.1, -0.1], ts=ts)
+    yield "cell", setting, 1.4258, CONSTANT
+
+
+def gbm():
+    """Geometric Brownian motion, exact end; the reference is the closed form of the SDE."""
+    sde = nb.SDE(lambda t, x, args: 0.1 * x, lambda t, x, args: 0.4 * x)
+    setting = dict(sde=sde, condition=nb.ExactMatch().at([1.5]), x0=[1.0], t1=1.0, num_steps=50)
+    yield "gbm", setting, -0.872436, GUIDES
+
+
+CASES = {"kunita": kunita, "wing": wing, "cell": cell, "gbm": gbm}
+
+
+def measure(name, setting, reference, guide_name, guide, solver, num_particles) -> dict:
+    sde, condition, *_ = setting.values()
+    rest = {k: v for k, v in setting.items() if k not in ("sde", "condition")}
+    bridge = nb.GuidedBridge(sde, condition, guide=guide, solver=solver, **rest)
+    seconds = []
+    for _ in range(2):
+        start = time.perf_counter()
+        estimate = nb.estimate_evidence(bridge, jr.key(0), num_particles)
+        seconds.append(time.perf_counter() - start)
+    log_weights, ess = estimate.log_weights, float(estimate.ess)
+    return {
+        "case": name,
+        "guide": guide_name,
+        "mean": round(float(log_weights.mean()), 3),
+        "sd": round(float(log_weights.std()), 3),
+        "log_evidence": round(float(estimate.log_evidence), 4),
+        "standard_error": round(float(estimate.standard_error), 4),
+        "reference": reference,
+        "ess_percent": round(100 * ess / num_particles, 2),
+        "pareto_k": round(estimate.pareto_k, 2),
+        "pareto_k_threshold": round(nb.weights.pareto_k_threshold(num_particles), 2),
+        "seconds": round(seconds[1], 2),
+        "compile_seconds": round(seconds[0] - seconds[1], 2),
+        "milliseconds_per_effective_particle": round(1000 * seconds[1] / ess, 2),
+        "num_particles": num_particles,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
+    }
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="50 particles")
+    parser.add_argument("--particles", type=int, default=2000)
+    parser.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    particles = 50 if arguments.quick else arguments.particles
+    for case in arguments.cases:
+        for name, setting, reference, guides in CASES[case]():
+            for guide_name, (guide, solver) in guides.items():
+                row = measure(name, setting, reference, guide_name, guide, solver, particles)
+                print(json.dumps(row), flush=True)

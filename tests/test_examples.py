@@ -1,0 +1,52 @@
+"""The README's first page and the examples run as they stand."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+
+
+def run(*command, cwd):
+    done = subprocess.run(
+        [sys.executable, *command], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_first_page(tmp_path):
+    pytest.importorskip("ktch")
+    page = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S).group(1)
+    shorter = page.replace("num_warmup=500, num_samples=500", "num_warmup=5, num_samples=5, progress_bar=False")
+    shorter = shorter.replace("num_particles=4096", "num_particles=256")
+    assert shorter != page
+    (tmp_path / "page.py").write_text(
+        shorter + "\nprint(path.shape, float(log_weight), *map(float, (\n"
+        "    estimate.log_evidence, estimate.standard_error, estimate.ess, estimate.pareto_k)))\n"
+    )
+    *shape, log_weight, log_evidence, error, ess, k = (
+        run("page.py", cwd=tmp_path).replace("(", "").replace(")", "").split()
+    )
+    assert [int(n.rstrip(",")) for n in shape] == [51, 32, 2]
+    assert 100 < float(log_evidence) < 300 and float(error) < 0.2 and float(ess) > 50 and float(k) < 0.7
+    assert abs(float(log_weight) - float(log_evidence)) < 10
+
+
+def test_mosquito_wings(tmp_path):
+    pytest.importorskip("ktch")
+    pytest.importorskip("matplotlib")
+    out = run(str(ROOT / "examples/mosquito_wings.py"), "--quick", "--output", "output", cwd=tmp_path)
+    assert "r_hat" in out and "divergences: 0" in out
+    for name in ("wings.nc", "bridges.png", "posterior.png", "score.png"):
+        assert (tmp_path / "output" / name).stat().st_size > 5000
+
+
+def test_guided_weight_benchmark(tmp_path):
+    out = run(str(ROOT / "benchmarks/guided_weight.py"), "--quick", cwd=tmp_path)
+    assert float(re.search(r'"value_difference": ([^,]*)', out).group(1)) < 1e-4
