@@ -15,9 +15,9 @@ import numpy as np
 
 from .._checks import as_float, require, require_finite
 from .._types import RealScalar, State
-from ..bridges import GuidedBridge, time_grid
+from ..bridges import GuidedBridge
 from ..conditioning import AbstractMatch
-from ..guiding import AbstractGuide
+from ..guiding import AbstractGuide, time_grid
 from ..sdes import AbstractSDE, simulate
 from ._batch import find_batched, one_of
 from ._noise_driven import AbstractNoiseDriven

@@ -54,7 +54,7 @@ class AbstractNoiseDriven(dist.Distribution):
 
     @staticmethod
     def _check_data(parts, values):
-        """`ValueError` if one of the values, a leading axis of them, cannot be observed."""
+        """`ValueError` if one of the values, a leading axis of them, cannot be observed, by its match alone."""
         raise NotImplementedError
 
     @property
@@ -84,7 +84,9 @@ class AbstractNoiseDriven(dist.Distribution):
             f"`noise` must have one noise for each datum, batch shape {self.batch_shape}; got {noise.shape[:k]}. "
             "Draw it from `law.noise_prior()`, inside the same plates as the data.",
         )
-        return self._replace(noise=None)._widened(noise.shape[: noise.ndim - 3])._replace(noise=noise)
+        return (
+            self._replace(noise=None)._widened(noise.shape[: noise.ndim - len(self._noise_shape)])._replace(noise=noise)
+        )
 
     def sample(self, key, sample_shape=()):
         """Observations of the unconditioned process. The bound noise, which belongs to a datum, plays no part."""
@@ -212,14 +214,16 @@ class AbstractNoiseDriven(dist.Distribution):
                 self._check_seen(data, np.broadcast_to(mask, full))
 
     def _check_seen(self, data, seen):
-        """All data at once; one after the other to name the one that is wrong, or where each has its own law."""
-        if not seen.any() or not self._batched and _passes(self._check_data, self.parts, data[seen]):
+        """All data at once; one after the other to name the one that is wrong, or where each has its own match."""
+        batched = tuple({"match"} & set(self._batched))
+        match = {"match": self.parts["match"]}
+        if not seen.any() or not batched and _passes(self._check_data, match, data[seen]):
             return
         for index in map(tuple, np.argwhere(seen)):
             own = index[max(len(index) - len(self._own_shape), 0) :]
             own = (0,) * (len(self._own_shape) - len(own)) + own
             try:
-                self._check_data(one_of(self.parts, self._batched, self._own_shape, own), data[index][None])
+                self._check_data(one_of(match, batched, self._own_shape, own), data[index][None])
             except ValueError as e:
                 raise ValueError(f"datum {tuple(map(int, index))}: {e}" if index else str(e)) from e
 

@@ -1,3 +1,22 @@
+from ._continuous import (
+    continuous_terms as continuous_terms,
+)
+from ._continuous import (
+    exact_message as exact_message,
+)
+from ._continuous import (
+    levy_area as levy_area,
+)
+from ._continuous import (
+    travel_continuous as travel_continuous,
+)
+from ._continuous import (
+    weight_rate as weight_rate,
+)
+from ._edge import arrive as arrive
+from ._edge import retrace as retrace
+from ._edge import travel as travel
+from ._grid import time_grid as time_grid
 from ._guides import (
     AbstractGuide as AbstractGuide,
 )
@@ -25,21 +44,6 @@ from ._steering import (
 from ._steering import (
     GaussianSteering as GaussianSteering,
 )
-from ._step import (
-    GridNoise as GridNoise,
-)
-from ._step import (
-    GuidedStep as GuidedStep,
-)
-from ._step import (
-    GuidedTerm as GuidedTerm,
-)
-from ._step import (
-    continuous_terms as continuous_terms,
-)
-from ._step import (
-    exact_message as exact_message,
-)
-from ._step import (
-    weight_rate as weight_rate,
-)
+from ._step import GridNoise as GridNoise
+from ._step import GuidedStep as GuidedStep
+from ._step import GuidedTerm as GuidedTerm

@@ -1,8 +1,7 @@
-"""The two ways to step a guided path, both diffrax solvers over the pair (state, log weight).
+"""The guided step, a diffrax solver over the pair (state, log weight), and the driving noise on a grid.
 
-`GuidedStep` draws each state from the model's own transition conditioned on the guide's forecast; the log weight is the
-exact discrete ratio. `continuous_terms` are the terms of the guided SDE dX° = (b + a ∇log h̃) dt + σ dW with the
-continuous-time weight ∫ G dt beside it, for any Itô solver.
+Each state is drawn from the model's own transition conditioned on the guide's forecast; the log weight is the exact
+discrete ratio.
 """
 
 from collections.abc import Callable
@@ -13,10 +12,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import add, apply, cholesky, columns, congruence, promote, solve_lower
+from .._linalg import apply
 from .._types import RealScalar, State
-from ..conditioning import GaussianMessage, Observation
-from ..sdes import AbstractSDE, LinearSDE
+from ..sdes import AbstractSDE
 from ._guides import AbstractPlan
 
 
@@ -54,7 +52,7 @@ class GridNoise(diffrax.AbstractBrownianPath):
 
 
 class GuidedTerm(diffrax.AbstractTerm):
-    """What `GuidedStep` steps: an SDE, a guide's plan at the step's end, the value to be led to, the noise of the step."""
+    """What `GuidedStep` steps: an SDE, a plan (`step(t0)` is its entry at the step's end), a value to be led to, noise."""
 
     sde: AbstractSDE
     plan: AbstractPlan
@@ -101,60 +99,3 @@ class GuidedStep(diffrax.AbstractItoSolver):
 
     def func(self, terms, t0, y0, args):
         raise NotImplementedError("A guided step has a Gaussian law and no vector field.")
-
-
-class _JointNoise(diffrax.AbstractTerm):
-    """σ dW on the state, nothing on the log weight."""
-
-    diffusion: Callable
-    control: diffrax.AbstractPath
-
-    def vf(self, t, y, args):
-        return self.diffusion(t, y[0])
-
-    def contr(self, t0, t1, **kwargs):
-        return self.control.evaluate(t0, t1, **kwargs)
-
-    def prod(self, vf, control):
-        dx = apply(vf, control)
-        return dx, jnp.zeros((), dx.dtype)
-
-
-def exact_message(auxiliary: LinearSDE, seen: Observation, t, t1, x: State, observed: State) -> GaussianMessage:
-    """h̃(t, ·) of a linear process in continuous time."""
-    step = auxiliary.exact_step(t, t1, x)
-    operator, n = seen.operator, x.shape[0]
-    M = congruence(operator, step.covariance)
-    if seen.factor is not None:
-        M = add(seen.covariance, M)
-    flow = step.operator if operator.ndim == 0 else promote(operator, 2, n) @ promote(step.operator, 2, n)
-    shift = apply(operator, step.shift)
-    return GaussianMessage(flow, shift, cholesky(M), observed, seen.log_scale)
-
-
-def weight_rate(sde: AbstractSDE, auxiliary: LinearSDE, message: GaussianMessage, t, x: State):
-    """The guided drift b + a r̃ and G = (b − b̃)ᵀ r̃ − ½ tr[(a − ã)(H − r̃ r̃ᵀ)], at (t, x)."""
-    n = x.shape[0]
-    b, r = sde.drift(t, x), message.score(x)
-    a, a_aux = sde.covariance(t, x), auxiliary.covariance(t, x)
-    excess = promote(a, 2, n) - promote(a_aux, 2, n)
-    root = solve_lower(message.factor, promote(message.operator, 2, n))
-    trace = columns(x) * jnp.sum((root @ excess) * root)
-    G = jnp.sum((b - auxiliary.drift(t, x)) * r) - 0.5 * (trace - jnp.sum(r * (excess @ r)))
-    return b + apply(a, r), G
-
-
-def continuous_terms(
-    sde: AbstractSDE,
-    auxiliary: LinearSDE,
-    seen: Observation,
-    t1: RealScalar,
-    observed: State,
-    control: diffrax.AbstractPath,
-) -> diffrax.MultiTerm:
-    """Terms of the guided SDE, with ∫ G dt as a second component of the solution."""
-
-    def field(t, y, args):
-        return weight_rate(sde, auxiliary, exact_message(auxiliary, seen, t, t1, y[0], observed), t, y[0])
-
-    return diffrax.MultiTerm(diffrax.ODETerm(field), _JointNoise(sde.diffusion, control))

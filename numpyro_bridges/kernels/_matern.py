@@ -22,8 +22,7 @@ def _coefficients(p: int) -> list[float]:
     """c_p, ..., c_0: the highest power first."""
     top = factorial(2 * p)
     return [
-        factorial(p) * factorial(p + i) * 2 ** (p - i) / (top * factorial(i) * factorial(p - i))
-        for i in range(p + 1)
+        factorial(p) * factorial(p + i) * 2 ** (p - i) / (top * factorial(i) * factorial(p - i)) for i in range(p + 1)
     ]
 
 

@@ -31,9 +31,7 @@ class QuadratureCovariance(AbstractKernel):
     upper: Float[Array, " dim"]
     num_cells: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(
-        self, kernel: AbstractKernel, lower: ArrayLike, upper: ArrayLike, num_cells: int | Sequence[int]
-    ):
+    def __init__(self, kernel: AbstractKernel, lower: ArrayLike, upper: ArrayLike, num_cells: int | Sequence[int]):
         self.kernel = kernel
         self.lower, self.upper = as_float(lower, "lower"), as_float(upper, "upper")
         shape = self.lower.shape
@@ -86,9 +84,7 @@ class QuadratureCovariance(AbstractKernel):
         return self(middle, middle)
 
     def convolved_with(self, other: AbstractKernel, dim: int) -> AbstractKernel:
-        raise ValueError(
-            "a `QuadratureCovariance` is a covariance: it is passed as `covariance=`, not as a kernel."
-        )
+        raise ValueError("a `QuadratureCovariance` is a covariance: it is passed as `covariance=`, not as a kernel.")
 
     def spectral_density(self, omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
         raise ValueError(

@@ -36,13 +36,10 @@ class Landmarks(AbstractSpace):
         w = as_float(1.0 / self.num_points if weights is None else weights, "weights")
         require(
             w.shape in ((), (self.num_points,)),
-            f"`weights` must be a scalar or of shape ({self.num_points},), one for each point; got shape "
-            f"{w.shape}.",
+            f"`weights` must be a scalar or of shape ({self.num_points},), one for each point; got shape {w.shape}.",
         )
         require_positive(w, "weights", "A point that is not seen is left out by the condition.")
-        self.weights = jnp.broadcast_to(
-            w.astype(w.dtype), (self.num_points,)
-        )  # a strong dtype: `jit` keys on it
+        self.weights = jnp.broadcast_to(w.astype(w.dtype), (self.num_points,))  # a strong dtype: `jit` keys on it
 
     @property
     def size(self) -> int:

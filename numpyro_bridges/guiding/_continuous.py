@@ -1,0 +1,119 @@
+"""The guided SDE in continuous time, for any Itô diffrax solver.
+
+dX° = (b + a ∇log h̃) dt + σ dW with h̃ of one linear auxiliary process, and beside it the log weight
+
+    log h̃(t0, x0) + ∫ G dt,    G = (b − b̃)ᵀ r̃ − ½ tr[(a − ã)(H − r̃ r̃ᵀ)]:
+
+consistent as dt → 0, biased at fixed dt, unbounded where dt · a · H is not small (Schauer et al. 2017).
+"""
+
+from collections.abc import Callable
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._linalg import add, apply, cholesky, columns, congruence, promote, solve_lower
+from .._types import RealScalar, State
+from ..conditioning import GaussianMessage, Observation
+from ..sdes import AbstractSDE, LinearSDE
+from ._edge import arrive
+from ._step import GridNoise
+
+
+class _JointNoise(diffrax.AbstractTerm):
+    """σ dW on the state, nothing on the log weight."""
+
+    diffusion: Callable
+    control: diffrax.AbstractPath
+
+    def vf(self, t, y, args):
+        return self.diffusion(t, y[0])
+
+    def contr(self, t0, t1, **kwargs):
+        return self.control.evaluate(t0, t1, **kwargs)
+
+    def prod(self, vf, control):
+        dx = apply(vf, control)
+        return dx, jnp.zeros((), dx.dtype)
+
+
+def exact_message(auxiliary: LinearSDE, seen: Observation, t, t1, x: State, observed: State) -> GaussianMessage:
+    """h̃(t, ·) of a linear process in continuous time."""
+    step = auxiliary.exact_step(t, t1, x)
+    operator, n = seen.operator, x.shape[0]
+    M = congruence(operator, step.covariance)
+    if seen.factor is not None:
+        M = add(seen.covariance, M)
+    flow = step.operator if operator.ndim == 0 else promote(operator, 2, n) @ promote(step.operator, 2, n)
+    shift = apply(operator, step.shift)
+    return GaussianMessage(flow, shift, cholesky(M), observed, seen.log_scale)
+
+
+def weight_rate(sde: AbstractSDE, auxiliary: LinearSDE, message: GaussianMessage, t, x: State):
+    """The guided drift b + a r̃ and G = (b − b̃)ᵀ r̃ − ½ tr[(a − ã)(H − r̃ r̃ᵀ)], at (t, x)."""
+    n = x.shape[0]
+    b, r = sde.drift(t, x), message.score(x)
+    a, a_aux = sde.covariance(t, x), auxiliary.covariance(t, x)
+    excess = promote(a, 2, n) - promote(a_aux, 2, n)
+    root = solve_lower(message.factor, promote(message.operator, 2, n))
+    trace = columns(x) * jnp.sum((root @ excess) * root)
+    G = jnp.sum((b - auxiliary.drift(t, x)) * r) - 0.5 * (trace - jnp.sum(r * (excess @ r)))
+    return b + apply(a, r), G
+
+
+def continuous_terms(
+    sde: AbstractSDE,
+    auxiliary: LinearSDE,
+    seen: Observation,
+    t1: RealScalar,
+    observed: State,
+    control: diffrax.AbstractPath,
+) -> diffrax.MultiTerm:
+    """Terms of the guided SDE, with ∫ G dt as a second component of the solution."""
+
+    def field(t, y, args):
+        return weight_rate(sde, auxiliary, exact_message(auxiliary, seen, t, t1, y[0], observed), t, y[0])
+
+    return diffrax.MultiTerm(diffrax.ODETerm(field), _JointNoise(sde.diffusion, control))
+
+
+def levy_area(solver: diffrax.AbstractSolver) -> type:
+    """What a solver needs to know of the driving path."""
+    needed = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    area = issubclass(needed, diffrax.AbstractSpaceTimeLevyArea)
+    return diffrax.SpaceTimeLevyArea if area else diffrax.BrownianIncrement
+
+
+def travel_continuous(
+    sde: AbstractSDE,
+    auxiliary: LinearSDE,
+    solver: diffrax.AbstractSolver,
+    seen: Observation,
+    ts: Float[Array, " K+1"],
+    x0: State,
+    noise: Float[Array, "K k *dim"],
+    observed: State,
+) -> tuple[Float[Array, "K n *dim"], Float[Array, ""]]:
+    """The states after x0 and the continuous log weight. An exactly observed end is pinned, whatever the solver."""
+    t_end = ts[-1]
+
+    @jax.checkpoint
+    def step(y, inputs):
+        t0, t1, z = inputs
+        control = GridNoise(jnp.stack([t0, t1]), z[None], levy_area(solver))
+        terms = continuous_terms(sde, auxiliary, seen, t_end, observed, control)
+        y, *_ = solver.step(terms, t0, t1, y, None, solver.init(terms, t0, t1, y, None), False)
+        return y, y[0]
+
+    exact = seen.factor is None
+    free = ts.shape[0] - 2 if exact else ts.shape[0] - 1
+    start = (x0, exact_message(auxiliary, seen, ts[0], t_end, x0, observed).log_value(x0))
+    (x, log_weight), path = jax.lax.scan(step, start, (ts[:free], ts[1 : free + 1], noise[:free]))
+    if exact:
+        message = exact_message(auxiliary, seen, ts[-2], t_end, x, observed)
+        log_weight = log_weight + (t_end - ts[-2]) * weight_rate(sde, auxiliary, message, ts[-2], x)[1]
+        end, _ = arrive(sde, seen, ts, x, noise[-1][: sde.noise_size(x)], observed)
+        path = jnp.concatenate([path, end[None]])
+    return path, log_weight

@@ -1,0 +1,106 @@
+"""One edge: a path from a state to what is seen of its end, its log weight, and the way back from a path to its noise.
+
+A bridge is one edge. `travel` takes every step but the last, led by a plan; `arrive` takes the last one, onto the
+observation itself, exactly whatever guides; `retrace` recovers the noise.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .._linalg import apply
+from .._types import Noise, State
+from ..conditioning import Observation
+from ..sdes import AbstractSDE, Transition
+from ._guides import AbstractPlan
+from ._steering import GaussianSteering
+from ._step import GridNoise, GuidedStep, GuidedTerm
+
+_MAX_KEPT = 128
+"""Largest n whose Cholesky factors, three n × n matrices a step, are kept for the reverse pass, not computed again."""
+
+
+def travel(
+    sde: AbstractSDE,
+    plan: AbstractPlan,
+    ts: Float[Array, " K+1"],
+    x0: State,
+    noise: Float[Array, "K-1 k *dim"],
+    observed: State,
+) -> tuple[Float[Array, "K-1 n *dim"], State, Float[Array, ""]]:
+    """The states after x0 but for the last, the last but one by itself, and the log weight so far."""
+    few = x0.shape[0] <= _MAX_KEPT
+
+    @functools.partial(
+        jax.checkpoint, prevent_cse=False, policy=lambda primitive, *_, **__: few and primitive.name == "cholesky"
+    )
+    def step(y, inputs):
+        t0, t1, z, planned = inputs
+        control = GridNoise(jnp.stack([t0, t1]), z[None])
+        terms = GuidedTerm(sde, plan, lambda _: planned, observed, control)
+        y, *_ = GuidedStep().step(terms, t0, t1, y, None, None, False)
+        return y, y[0]
+
+    start = (x0, jnp.zeros((), x0.dtype))
+    (x, log_weight), path = jax.lax.scan(step, start, (ts[:-2], ts[1:-1], noise, _ends(plan)))
+    return path, x, log_weight
+
+
+def arrive(
+    sde: AbstractSDE, seen: Observation, ts: Float[Array, " K+1"], x: State, z: Noise, observed: State
+) -> tuple[State, Float[Array, ""]]:
+    """The last state, and the log density of what is seen given the last but one."""
+    transition, steering = _last_step(sde, seen, ts, x, observed)
+    x = transition.mean + apply(transition.factor, steering.drive(z)[0])
+    return x, steering.log_evidence() + seen.log_scale
+
+
+def retrace(
+    sde: AbstractSDE,
+    plan: AbstractPlan,
+    seen: Observation,
+    ts: Float[Array, " K+1"],
+    path: Float[Array, "K+1 n *dim"],
+    observed: State,
+    key: PRNGKeyArray | None,
+) -> Float[Array, "K k *dim"]:
+    """The noise of a path; what the path leaves free of it is drawn with `key`, 0 without one."""
+    free = jnp.zeros((ts.shape[0], sde.noise_size(path[0]), *path.shape[2:]), path.dtype)
+    if key is not None:
+        free = jr.normal(key, free.shape, path.dtype)
+
+    def step(x, x_next, t0, t1, planned, free):
+        transition = sde.transition(t0, t1, x)
+        steering = plan.steer(planned, transition, t1 - t0, x, observed)
+        return steering.inverse(_driving_noise(transition, x_next, free))
+
+    z = jax.vmap(step)(path[:-2], path[1:-1], ts[:-2], ts[1:-1], _ends(plan), free[:-2])
+    transition, steering = _last_step(sde, seen, ts, path[-2], observed)
+    last = steering.inverse(_driving_noise(transition, path[-1], free[-2]))
+    if seen.factor is None:
+        last = last + steering.without_effect(free[-1])
+    return jnp.concatenate([z, last[None]])
+
+
+def _ends(plan: AbstractPlan):
+    """The plan's entries at the end of every step but the last."""
+    return jax.tree.map(lambda a: a[1:], plan.steps)
+
+
+def _last_step(sde, seen, ts, x, observed) -> tuple[Transition, GaussianSteering]:
+    transition = sde.transition(ts[-2], ts[-1], x)
+    return transition, GaussianSteering(transition, seen.operator, jnp.zeros_like(observed), seen.covariance, observed)
+
+
+def _driving_noise(transition: Transition, x: State, free: Noise) -> Noise:
+    """u with mean + σ u = x; where σ leaves a part of u free it is taken from `free`."""
+    d = x - transition.mean
+    factor = transition.factor
+    if factor.ndim < 2:
+        factor = factor if factor.ndim == 0 or d.ndim == 1 else factor[:, None]
+        return jnp.where(factor == 0, free, d / jnp.where(factor == 0, 1.0, factor))
+    pseudo_inverse = jnp.linalg.pinv(factor)
+    return pseudo_inverse @ (d - factor @ free) + free
