@@ -2,10 +2,10 @@
 
     python benchmarks/guided_weight.py [--quick] [--x64] [--sizes 8 32 128] [--memory]
 
-One Kunita flow of n landmarks, 100 steps, 64 paths, the receding guide: value, and gradient with respect to the noise, the
-amplitude and the length scale. One JSON line per size: run times (minimum over repeats, the two programs in turn), their
-ratios, compile times, flops by XLA's cost analysis. Last the peak memory of one gradient at 256 landmarks, in a process
-of its own.
+One Kunita flow of n landmarks, 100 steps, 64 paths, the receding guide: value, and gradient with respect to the noise,
+the amplitude and the length scale. One JSON line per size: run times (minimum over repeats, the two programs in turn),
+their ratios, compile times, flops by XLA's cost analysis. Last the peak memory of one gradient at 256 landmarks, in a
+process of its own.
 """
 
 import argparse

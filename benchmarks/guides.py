@@ -2,9 +2,9 @@
 
     python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing cell gbm]
 
-One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard error, ESS in percent, k̂ with
-the threshold above which the evidence is not to be trusted, seconds of a run without compilation, and seconds per effective
-particle. `reference` is a log evidence from elsewhere: a closed form, or a long run. All in double precision.
+One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard error, ESS in percent, k̂
+with the threshold above which the evidence is not to be trusted, seconds of a run without compilation, and seconds per
+effective particle. `reference` is a log evidence from elsewhere: a closed form, or a long run. All in double precision.
 
 The simulated Kunita cases are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or `../shared/data`.
 """

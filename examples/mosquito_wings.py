@@ -1,9 +1,9 @@
 # %% [markdown]
 # # How variable are wing shapes within a genus, and on what length scale?
 #
-# Each wing outline is the end of a Kunita flow that started at the genus mean: points close together move together, over a
-# length scale ℓ, by amounts set by an amplitude α. The outlines are seen with a small observation error. NUTS draws from
-# the posterior of (α, ℓ) and of the paths themselves.
+# Each wing outline is the end of a Kunita flow that started at the genus mean: points close together move together,
+# over a length scale ℓ, by amounts set by an amplitude α. The outlines are seen with a small observation error. NUTS
+# draws from the posterior of (α, ℓ) and of the paths themselves.
 #
 #     python examples/mosquito_wings.py            # 2 chains, some minutes on 2 cores
 #     python examples/mosquito_wings.py --quick    # under a minute, to see that all runs
@@ -43,7 +43,8 @@ numpyro.set_host_device_count(2)
 
 # %% [markdown]
 # ## The data
-# Real outlines, resampled by arc length, aligned, at unit RMS radius; the observation error is small beside their spread.
+# Real outlines, resampled by arc length, aligned, at unit RMS radius; the observation error is small beside their
+# spread.
 
 # %%
 wings = nb.datasets.mosquito_wings(num_points=num_points, genus=arguments.genus)

@@ -5,11 +5,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 
 def concrete(x: Any) -> np.ndarray | None:
     """The value as a NumPy array, or None while a program is traced."""
-    return None if isinstance(x, jax.core.Tracer) else np.asarray(x)
+    return None if isinstance(x, Tracer) else np.asarray(x)
 
 
 def as_float(x: Any, name: str) -> jax.Array:
@@ -20,9 +21,15 @@ def as_float(x: Any, name: str) -> jax.Array:
         raise ValueError(f"`{name}` must be a number or an array of numbers; got {x!r}.") from e
 
 
+def floating(x: Any, name: str) -> jax.Array:
+    """An array that keeps its precision; whole numbers become the default float type."""
+    keeps = jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)
+    return jnp.asarray(x) if keeps else as_float(x, name)
+
+
 def require(ok: Any, message: str) -> None:
     """`ValueError(message)` unless `ok`; a traced condition passes."""
-    if not isinstance(ok, jax.core.Tracer) and not bool(ok):
+    if not isinstance(ok, Tracer) and not bool(ok):
         raise ValueError(message)
 
 

@@ -1,6 +1,6 @@
-"""Type aliases. A state is one shape: `(n, dim)`, or a plain vector `(n,)`; code is written for one state, callers vmap."""
+"""Type aliases. A state is one shape, `(n, dim)`, or a plain vector `(n,)`; code is for one state, callers vmap."""
 
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from jaxtyping import Array, Float
 
@@ -13,5 +13,8 @@ Noise: TypeAlias = Float[Array, "k *dim"]
 Structured: TypeAlias = Float[Array, "..."]
 """A linear map on the first axis of a state: `()` a multiple of the identity, `(n,)` a diagonal, `(m, n)` a matrix."""
 
-RealScalar: TypeAlias = float | int | Float[Array, ""]
+if TYPE_CHECKING:
+    RealScalar: TypeAlias = float | int | Array
+else:
+    RealScalar: TypeAlias = float | int | Float[Array, ""]
 """A time or a parameter: a Python number or a 0-d array."""

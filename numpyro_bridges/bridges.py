@@ -97,15 +97,15 @@ class GuidedBridge(eqx.Module):
         name = type(self.solver).__name__
         require(
             isinstance(self.solver, diffrax.AbstractItoSolver) or self.sde.ito_is_stratonovich(self.x0),
-            f"`solver` must be an Itô solver (diffrax.Euler, diffrax.ItoMilstein); got {name}. Guided proposals and their "
-            "weights are Itô statements, and this SDE's Stratonovich reading is another process.",
+            f"`solver` must be an Itô solver (diffrax.Euler, diffrax.ItoMilstein); got {name}. Guided proposals and "
+            "their weights are Itô statements, and this SDE's Stratonovich reading is another process.",
         )
         require(
             isinstance(self.solver, (diffrax.AbstractItoSolver, diffrax.AbstractStratonovichSolver)),
             f"`solver` must be a solver for SDEs; got {name}.",
         )
         if not self._is_discrete:
-            seen, reference, _ = self._end()
+            seen, reference = self._end()
             auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
             if self.condition.exact:
                 a = congruence(seen.operator, self.sde.covariance(self.ts[-1], reference))
@@ -119,7 +119,7 @@ class GuidedBridge(eqx.Module):
                 )
 
     def _check_exact(self):
-        seen, _, _ = self._end()
+        seen, _ = self._end()
         dt = self.ts[-1] - self.ts[-2]
         S = congruence(seen.operator, self.sde.transition(self.ts[0], self.ts[0] + dt, self.x0).covariance)
         if concrete(S) is not None:
@@ -128,8 +128,8 @@ class GuidedBridge(eqx.Module):
             scale = jnp.sqrt(jnp.max(jnp.abs(S)))
             require(
                 jnp.all(pivots > 1e-10 * scale),
-                "an exact match needs noise in every observed direction, and the covariance of the last step, L a Lᵀ dt, "
-                "is singular: an observed component has no noise of its own. Use `InexactMatch` with a small variance.",
+                "an exact match needs noise in every observed direction, and the covariance of the last step, L a Lᵀ dt"
+                ", is singular: an observed component has no noise of its own. Use `InexactMatch`, a small variance.",
             )
 
     @property
@@ -143,7 +143,7 @@ class GuidedBridge(eqx.Module):
 
     @property
     def noise_shape(self) -> tuple[int, int, int]:
-        """(num_steps, k, dim): k noises per coordinate. A `CylinderSet` has one row more, to draw the point in the set."""
+        """(num_steps, k, dim): k noises per coordinate. A `CylinderSet` has one row more, to draw its point."""
         k = self.sde.noise_size(self.x0)
         if not self._is_discrete and issubclass(levy_area(self.solver), diffrax.SpaceTimeLevyArea):
             k = 2 * k
@@ -180,7 +180,7 @@ class GuidedBridge(eqx.Module):
         return noise[:extra], noise[extra:]
 
     def _end(self):
-        """What is seen, a state that meets it, and the guide's plan, or None where a diffrax solver steps."""
+        """What is seen, and a state that meets it."""
         seen = self.condition.observation(self.sde, self.x0)
         free = self.x0
 
@@ -190,16 +190,16 @@ class GuidedBridge(eqx.Module):
         if seen.operator.ndim or self.condition.num_extra_noises:  # part of the end state is open
             free, _ = jax.lax.scan(drift_step, free, (self.ts[:-1], self.ts[1:]))
         reference = self.condition.reference(self.sde, free)
-        plan = self.guide.plan(self.sde, seen, reference, self.ts) if self._is_discrete else None
-        return seen, reference, plan
+        return seen, reference
 
     def _message(self, t, x: State, observed: State):
         """The guide's forecast of what is seen from x at the grid time at or below t."""
-        seen, reference, plan = self._end()
-        if plan is None:
+        seen, reference = self._end()
+        if not self._is_discrete:
             auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
             return exact_message(auxiliary, seen, t, self.ts[-1], x, observed)
-        k = GridNoise(self.ts, self.x0).index(t)
+        plan = self.guide.plan(self.sde, seen, reference, self.ts)
+        k = GridNoise(ts=self.ts, noise=self.x0).index(t)
         return plan.message(jax.tree.map(lambda a: a[k], plan.steps), self.sde, self.ts[k], x, observed)
 
     def _target(self, extra) -> Target:
@@ -228,13 +228,14 @@ class GuidedBridge(eqx.Module):
     @eqx.filter_jit
     def _run(self, noise):
         extra, noise = self._split(noise)
-        seen, reference, plan = self._end()
+        seen, reference = self._end()
         target = self._target(extra)
         v = target.value
-        if plan is None:
+        if not self._is_discrete:
             auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
             path, log_weight = travel_continuous(self.sde, auxiliary, self.solver, seen, self.ts, self.x0, noise, v)
         else:
+            plan = self.guide.plan(self.sde, seen, reference, self.ts)
             path, x, log_weight = travel(self.sde, plan, self.ts, self.x0, noise[:-1], v)
             end, log_density = arrive(self.sde, seen, self.ts, x, noise[-1], v)
             path, log_weight = jnp.concatenate([path, end[None]]), log_weight + log_density
@@ -253,8 +254,9 @@ class GuidedBridge(eqx.Module):
         path = as_float(path, "path").astype(self.x0.dtype)
         shape = (self.num_steps + 1, *self.x0.shape)
         require(path.shape == shape, f"`path` must have shape {shape}; got {path.shape}.")
-        seen, _, plan = self._end()
-        if seen.factor is None:
+        seen, reference = self._end()
+        plan = self.guide.plan(self.sde, seen, reference, self.ts)
+        if seen.exact:
             observed = apply(seen.operator, path[-1])
         else:
             observed = self._target(jnp.zeros((0,))).value

@@ -13,9 +13,9 @@ from .bridges import GuidedBridge
 class EvidenceEstimate(eqx.Module):
     """An estimate of log p(condition | x0).
 
-    `log_evidence` is the log of the mean weight, `standard_error` its Monte Carlo standard error, `ess` the effective number of
-    particles. `pareto_k` above min(1 − 1/log10(num_particles), 0.7) says that the weights' tail is too heavy for either to be
-    trusted (Vehtari et al. 2024). `log_weights` `(num_particles,)`.
+    `log_evidence` is the log of the mean weight, `standard_error` its Monte Carlo standard error, `ess` the effective
+    number of particles. `pareto_k` above min(1 − 1/log10(num_particles), 0.7) says that the weights' tail is too heavy
+    for either to be trusted (Vehtari et al. 2024). `log_weights` `(num_particles,)`.
     """
 
     log_evidence: Float[Array, ""]

@@ -24,10 +24,15 @@ class Observation(eqx.Module):
     log_scale: Float[Array, ""]
 
     @property
-    def covariance(self) -> Structured | None:
-        """factor factorᵀ."""
-        P = self.factor
-        return P if P is None else congruence(P, jnp.ones((), P.dtype))
+    def exact(self) -> bool:
+        """Whether it has no noise."""
+        return self.factor is None
+
+    @property
+    def covariance(self) -> Structured:
+        """factor factorᵀ, 0 where it is exact."""
+        one = jnp.ones((), self.operator.dtype)
+        return 0 * one if self.factor is None else congruence(self.factor, one)
 
 
 class Target(eqx.Module):
@@ -40,11 +45,13 @@ class Target(eqx.Module):
 class AbstractCondition(eqx.Module):
     """An event, or an observed value, of the end state."""
 
-    exact: eqx.AbstractVar[bool]
-    """Whether the end state is pinned; decides the default grid."""
-
     num_extra_noises: eqx.AbstractClassVar[int]
     """Rows of noise that choose the target, before the first step."""
+
+    @property
+    @abc.abstractmethod
+    def exact(self) -> bool:
+        """Whether the end state is pinned; decides the default grid."""
 
     @abc.abstractmethod
     def check(self, sde: AbstractSDE, x: State) -> None:

@@ -7,10 +7,11 @@ draw
 
     P(X_T ∈ Γ) = E[p(v | x0) / r(v)],      p / r = (p / N(v; μ, N Nᵀ)) Π_i P_i,
 
-P_i being the probability of that interval. All paths end in Γ. Where the guide's law is exact and its covariance diagonal,
-the weight is the product of the P_i, the same number for every noise.
+P_i being the probability of that interval. All paths end in Γ. Where the guide's law is exact and its covariance
+diagonal, the weight is the product of the P_i, the same number for every noise.
 """
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -34,9 +35,9 @@ class CylinderSet(AbstractCondition):
 
     **Arguments:**
 
-    - `lower`, `upper`: `(N, dim)`, or `(N,)` for plain vectors, or scalars broadcast to it, for the first N ≤ n rows of the
-      state: values at points or coefficients of an orthonormal basis. An infinite bound leaves that side free; equal bounds
-      pin the coordinate. Rows that are known to be free are left out.
+    - `lower`, `upper`: `(N, dim)`, or `(N,)` for plain vectors, or scalars broadcast to it, for the first N ≤ n rows of
+      the state: values at points or coefficients of an orthonormal basis. An infinite bound leaves that side free;
+      equal bounds pin the coordinate. Rows that are known to be free are left out.
     """
 
     lower: State
@@ -82,12 +83,12 @@ class CylinderSet(AbstractCondition):
         low, high = self.lower.astype(x.dtype), self.upper.astype(x.dtype)
         return lift(self.observation(sde, x).operator, x, jnp.clip(x[np.array(self.rows)], low, high))
 
-    def _scan(self, mean: State, factor: Structured, choose, driver: State):
+    def _scan(self, mean: State, factor: Structured, choose: Callable[..., Array], driver: State):
         """Coordinate after coordinate: its standardised interval, the value chosen in it, its log weight."""
         m = mean.shape[0]
         lower, upper = self.lower.astype(mean.dtype), self.upper.astype(mean.dtype)
 
-        def one(low, high, center, z, scale):
+        def one(low: Array, high: Array, center: Array, z: Array, scale: Array):
             low, high = _standardise(low, center, scale), _standardise(high, center, scale)
             pinned = low == high
             w = jnp.where(pinned, low, choose(z, jnp.where(pinned, -1.0, low), jnp.where(pinned, 1.0, high)))
@@ -117,7 +118,7 @@ class CylinderSet(AbstractCondition):
     def target(self, law_mean, law_factor, noise):
         m = law_mean.shape[0]
         w, log_weights = self._scan(law_mean, law_factor, truncated_quantile, noise[0, :m])
-        d = law_factor[:, None] if law_factor.ndim == 1 and w.ndim == 2 else law_factor
+        d: Array = law_factor[:, None] if law_factor.ndim == 1 and w.ndim == 2 else law_factor
         value = law_mean + (law_factor @ w if law_factor.ndim == 2 else d * w)
         low, high = self.lower.astype(value.dtype), self.upper.astype(value.dtype)
         return Target(jnp.clip(value, low, high), jnp.sum(log_weights))

@@ -80,15 +80,14 @@ class ExactMatch(AbstractMatch):
         if mask is not None:
             require(operator is None, "Give `operator` or `mask`, not both.")
             keep = concrete(mask)
-            require(
-                keep is not None, "`mask` of an exact match must be known when the program is traced; use InexactMatch."
-            )
+            if keep is None:
+                raise ValueError("`mask` of an exact match must be known when the program is traced; use InexactMatch.")
             operator = np.eye(len(keep))[np.asarray(keep, bool)]
         self.operator = _operator(operator)
 
     def at(self, observed) -> AbstractCondition:
         """The condition L X_T = observed."""
-        return _Seen(self, _datum(observed))
+        return _Seen(match=self, observed=_datum(observed))
 
     def observation(self, sde: AbstractSDE, x: State) -> Observation:
         return Observation(self.operator.astype(x.dtype), None, jnp.zeros((), x.dtype))
@@ -109,12 +108,12 @@ class InexactMatch(AbstractMatch):
     **Arguments:**
 
     - `variance`: σ, positive: a number, or `(m,)` or `(m, m)` to be divided by the weights in the same way.
-    - `operator`: L, `(m, n)` or a lineax operator; the identity if not given. Rows of the identity (a selection of points)
-      keep their points' weights; any other operator is seen in the Euclidean norm of R^m.
+    - `operator`: L, `(m, n)` or a lineax operator; the identity if not given. Rows of the identity (a selection of
+      points) keep their points' weights; any other operator is seen in the Euclidean norm of R^m.
     - `mask`: `(n,)` booleans instead of `operator`: which rows are seen. The datum's other rows are ignored.
     - `space`: whose weights to use; the SDE's if not given, Euclidean where it has none.
-    - `normalised`: `True` is the Lebesgue density of the observation. `False` is the kernel itself, whose expectation has a
-      limit as n → ∞; it is no density, so distributions refuse it.
+    - `normalised`: `True` is the Lebesgue density of the observation. `False` is the kernel itself, whose expectation
+      has a limit as n → ∞; it is no density, so distributions refuse it.
 
     `InexactMatch.from_point_sd(sd, space)` takes the standard deviation of one point's coordinate instead.
     """
@@ -156,7 +155,7 @@ class InexactMatch(AbstractMatch):
 
     def at(self, observed) -> AbstractCondition:
         """The condition that `observed` was seen."""
-        return _Seen(self, _datum(observed, self.mask))
+        return _Seen(match=self, observed=_datum(observed, self.mask))
 
     def _factor(self, sde: AbstractSDE, x: State) -> Structured:
         space = sde.space if self.space is None else self.space
@@ -225,7 +224,8 @@ def _operator(operator) -> Structured:
     value = concrete(operator)
     require(
         value is None or np.linalg.matrix_rank(value) == len(value),
-        f"`operator` must have independent rows; its rank is below its {operator.shape[0]} rows. Remove repeated observations.",
+        f"`operator` must have independent rows; its rank is below its {operator.shape[0]} rows. "
+        "Remove repeated observations.",
     )
     return operator
 

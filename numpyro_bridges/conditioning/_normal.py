@@ -1,16 +1,22 @@
 """Normal probabilities of intervals in log space, accurate and with finite gradients deep in the tails."""
 
+from collections.abc import Callable
+from typing import cast
+
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import log_ndtr, ndtri
+from jax.scipy import special
+from jax.scipy.special import ndtri
 from jaxtyping import Array, Float
+
+log_ndtr = cast(Callable[[Array], Array], special.log_ndtr)
 
 _LOG_SQRT_2PI = 0.9189385332046727
 _FAR = 1e4
 """Stands in for an infinite bound, in standard deviations."""
 
 
-def _left(lower, upper, *others):
+def _left(lower: Array, upper: Array, *others: Array):
     """The interval mirrored into the left half where it lies in the right one, and what else changes sign with it."""
     lower = jnp.where(lower == -jnp.inf, -_FAR, lower)
     upper = jnp.where(upper == jnp.inf, _FAR, upper)
@@ -28,7 +34,7 @@ def log_interval_probability(lower: Float[Array, "..."], upper: Float[Array, "..
 
 
 @jax.custom_jvp
-def log_ndtri(log_p: Float[Array, "..."]) -> Float[Array, "..."]:
+def _log_ndtri(log_p: Float[Array, "..."]) -> Float[Array, "..."]:
     """The normal quantile of exp(log_p), from the logarithm: finite where exp(log_p) underflows."""
     start = jnp.where(
         log_p > -5.0, ndtri(jnp.exp(jnp.maximum(log_p, -5.0))), -jnp.sqrt(jnp.maximum(-2.0 * log_p - 2.0, 1.0))
@@ -41,16 +47,19 @@ def log_ndtri(log_p: Float[Array, "..."]) -> Float[Array, "..."]:
     return jax.lax.fori_loop(0, 5, newton, start)
 
 
-@log_ndtri.defjvp
+@_log_ndtri.defjvp
 def _(primals, tangents):
     w = log_ndtri(primals[0])
     return w, tangents[0] * jnp.exp(log_ndtr(w) + 0.5 * w * w + _LOG_SQRT_2PI)
 
 
+log_ndtri = cast(Callable[[Array], Array], _log_ndtri)
+
+
 def truncated_quantile(
     z: Float[Array, "..."], lower: Float[Array, "..."], upper: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """The standard normal truncated to [lower, upper] at the quantile of z: monotone in z, the identity without bounds."""
+    """The standard normal truncated to [lower, upper] at the quantile of z: monotone, the identity without bounds."""
     free = jnp.isinf(lower) & jnp.isinf(upper) & (lower < upper)
     sign, low, high, z_left = _left(jnp.where(free, -1.0, lower), jnp.where(free, 1.0, upper), z)
     log_p = jnp.logaddexp(log_ndtr(low) + log_ndtr(-z_left), log_ndtr(high) + log_ndtr(z_left))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import numpyro.distributions as dist
+from jaxtyping import Array
 from numpyro.distributions import constraints
 
 from .._checks import concrete, require
@@ -118,7 +119,7 @@ class AbstractNoiseDriven(dist.Distribution):
         if mask is not None:
             hidden = ~mask.reshape(mask.shape + (1,) * (value.ndim - mask.ndim))
             value = jnp.where(hidden, self._over_batch(self._placeholder, full, value), value)
-        log_prob = self._over_batch(self._log_weight, full, value, self.noise)
+        log_prob: Array = self._over_batch(self._log_weight, full, value, self.noise)
         log_prob = jnp.where(True if mask is None else mask, log_prob, 0.0)
         return jnp.sum(log_prob, axis=tuple(range(-self._moved, 0)))
 

@@ -43,9 +43,7 @@ def exact_message(auxiliary: LinearSDE, seen: Observation, t, t1, x: State, obse
     """h̃(t, ·) of a linear process in continuous time."""
     step = auxiliary.exact_step(t, t1, x)
     operator, n = seen.operator, x.shape[0]
-    M = congruence(operator, step.covariance)
-    if seen.factor is not None:
-        M = add(seen.covariance, M)
+    M = add(congruence(operator, step.covariance), seen.covariance)
     flow = step.operator if operator.ndim == 0 else promote(operator, 2, n) @ promote(step.operator, 2, n)
     shift = apply(operator, step.shift)
     return GaussianMessage(flow, shift, cholesky(M), observed, seen.log_scale)
@@ -102,16 +100,15 @@ def travel_continuous(
     @jax.checkpoint
     def step(y, inputs):
         t0, t1, z = inputs
-        control = GridNoise(jnp.stack([t0, t1]), z[None], levy_area(solver))
+        control = GridNoise(ts=jnp.stack([t0, t1]), noise=z[None], levy_area=levy_area(solver))
         terms = continuous_terms(sde, auxiliary, seen, t_end, observed, control)
         y, *_ = solver.step(terms, t0, t1, y, None, solver.init(terms, t0, t1, y, None), False)
         return y, y[0]
 
-    exact = seen.factor is None
-    free = ts.shape[0] - 2 if exact else ts.shape[0] - 1
+    free = ts.shape[0] - 2 if seen.exact else ts.shape[0] - 1
     start = (x0, exact_message(auxiliary, seen, ts[0], t_end, x0, observed).log_value(x0))
     (x, log_weight), path = jax.lax.scan(step, start, (ts[:free], ts[1 : free + 1], noise[:free]))
-    if exact:
+    if seen.exact:
         message = exact_message(auxiliary, seen, ts[-2], t_end, x, observed)
         log_weight = log_weight + (t_end - ts[-2]) * weight_rate(sde, auxiliary, message, ts[-2], x)[1]
         end, _ = arrive(sde, seen, ts, x, noise[-1][: sde.noise_size(x)], observed)

@@ -1,7 +1,7 @@
 """The hot line of a guided step, u = z + Aᵀ N⁻ᵀ (y − (N + P)⁻¹ A z) and log|P| − log|N|, with a derivative by hand.
 
-With N Nᵀ = S, P Pᵀ = M, y = N⁻¹ r, g = (N + P)⁻¹ A z, h = y − g, w = N⁻ᵀ h, so u = z + Aᵀ w. Both factors enter only through
-solves with a few columns, so their cotangents have low rank before the factorisation's own pullback,
+With N Nᵀ = S, P Pᵀ = M, y = N⁻¹ r, g = (N + P)⁻¹ A z, h = y − g, w = N⁻ᵀ h, so u = z + Aᵀ w. Both factors enter only
+through solves with a few columns, so their cotangents have low rank before the factorisation's own pullback,
 
     S̄ = N⁻ᵀ Φ(Nᵀ N̄) N⁻¹,      Φ the symmetric matrix with the lower half of its argument,
 

@@ -39,7 +39,7 @@ def travel(
     )
     def step(y, inputs):
         t0, t1, z, planned = inputs
-        control = GridNoise(jnp.stack([t0, t1]), z[None])
+        control = GridNoise(ts=jnp.stack([t0, t1]), noise=z[None])
         terms = GuidedTerm(sde, plan, lambda _: planned, observed, control)
         y, *_ = GuidedStep().step(terms, t0, t1, y, None, None, False)
         return y, y[0]
@@ -80,7 +80,7 @@ def retrace(
     z = jax.vmap(step)(path[:-2], path[1:-1], ts[:-2], ts[1:-1], _ends(plan), free[:-2])
     transition, steering = _last_step(sde, seen, ts, path[-2], observed)
     last = steering.inverse(_driving_noise(transition, path[-1], free[-2]))
-    if seen.factor is None:
+    if seen.exact:
         last = last + steering.without_effect(free[-1])
     return jnp.concatenate([z, last[None]])
 
@@ -92,7 +92,8 @@ def _ends(plan: AbstractPlan):
 
 def _last_step(sde, seen, ts, x, observed) -> tuple[Transition, GaussianSteering]:
     transition = sde.transition(ts[-2], ts[-1], x)
-    return transition, GaussianSteering(transition, seen.operator, jnp.zeros_like(observed), seen.covariance, observed)
+    covariance = None if seen.exact else seen.covariance
+    return transition, GaussianSteering(transition, seen.operator, jnp.zeros_like(observed), covariance, observed)
 
 
 def _driving_noise(transition: Transition, x: State, free: Noise) -> Noise:

@@ -25,7 +25,8 @@ def time_grid(
             f"`ts` must end at `t1`; got {t1} and {ts[-1]}.",
         )
         return ts
-    require(t1 is not None and num_steps is not None, "Give `t1` and `num_steps`, or a grid `ts`.")
+    if t1 is None or num_steps is None:
+        raise ValueError("Give `t1` and `num_steps`, or a grid `ts`.")
     require(
         isinstance(num_steps, (int, np.integer)) and not isinstance(num_steps, bool) and num_steps >= 1,
         f"`num_steps` must be a positive integer; got {num_steps!r}.",

@@ -1,12 +1,13 @@
 """Guides: how a path is led to what is observed.
 
-`guide.plan(...)` does what depends on the parameters and the grid only, once; the plan's `steer` is the cheap work of one
-step. A guide may know the parameters, the data and the path so far, never later noise.
+`guide.plan(...)` does what depends on the parameters and the grid only, once; the plan's `steer` is the cheap work of
+one step. A guide may know the parameters, the data and the path so far, never later noise.
 
 The backward filter in covariance form: with the auxiliary process's steps x' ~ N(Φ x + φ, C) and v = L x_K + N(0, Σ),
 the forecast of v from x_k is N(Λ_k x_k + s_k, M_k),
 
-    Λ_K = L,  s_K = 0,  M_K = Σ;     Λ_k = Λ_{k+1} Φ_k,   s_k = s_{k+1} + Λ_{k+1} φ_k,   M_k = M_{k+1} + Λ_{k+1} C_k Λ_{k+1}ᵀ.
+    Λ_K = L,  s_K = 0,  M_K = Σ;
+    Λ_k = Λ_{k+1} Φ_k,   s_k = s_{k+1} + Λ_{k+1} φ_k,   M_k = M_{k+1} + Λ_{k+1} C_k Λ_{k+1}ᵀ.
 """
 
 import abc
@@ -60,7 +61,8 @@ class _FrozenPlan(AbstractPlan):
     steps: tuple[Structured, State, Structured]
 
     def steer(self, step, transition, dt, x, observed):
-        return GaussianSteering(transition, *step, observed)
+        operator, shift, covariance = step
+        return GaussianSteering(transition, operator, shift, covariance, observed)
 
     def message(self, step, sde, t, x, observed):
         operator, shift, covariance = step
@@ -72,8 +74,9 @@ class FrozenGuide(AbstractGuide):
 
     **Arguments:** `auxiliary`: a `LinearSDE` or `BrownianMotion`; by default the SDE linearised at the observed end.
 
-    The auxiliary process is stepped by the SDE's own scheme, so that an auxiliary process equal to the SDE gives the same
-    log weight for every noise. Schauer, van der Meulen and van Zanten (2017); Mider, Schauer and van der Meulen (2021).
+    The auxiliary process is stepped by the SDE's own scheme, so that an auxiliary process equal to the SDE gives the
+    same log weight for every noise. Schauer, van der Meulen and van Zanten (2017); Mider, Schauer and van der
+    Meulen (2021).
     """
 
     auxiliary: AbstractSDE | None
@@ -81,7 +84,8 @@ class FrozenGuide(AbstractGuide):
     def __init__(self, auxiliary: AbstractSDE | None = None):
         require(
             auxiliary is None or isinstance(auxiliary, (LinearSDE, BrownianMotion)),
-            f"`auxiliary` must be a LinearSDE or a BrownianMotion, whose messages are Gaussian; got {type(auxiliary).__name__}.",
+            f"`auxiliary` must be a LinearSDE or a BrownianMotion, whose messages are Gaussian; "
+            f"got {type(auxiliary).__name__}.",
         )
         self.auxiliary = auxiliary
 
@@ -161,14 +165,16 @@ class RecedingGuide(AbstractGuide):
         one = promote(jnp.ones((), reference.dtype), ndim, n)
         start = (one, jnp.zeros_like(apply(seen.operator, reference)), jnp.zeros_like(_square(one)))
         _, planned = jax.lax.scan(back, start, (operator, shift, jnp.diff(ts)), reverse=True)
-        noise = jnp.zeros((), reference.dtype) if seen.factor is None else seen.covariance
-        return _RecedingPlan(planned, seen.operator, noise, sde.covariance(ts[-1], reference), self.end_weight)
+        return _RecedingPlan(
+            planned, seen.operator, seen.covariance, sde.covariance(ts[-1], reference), self.end_weight
+        )
 
 
 class DriftGuide(AbstractGuide):
     """Another guide's score as a drift: Euler steps of b + a ∇log h̃ instead of the conditional Gaussian step.
 
-    The weight is still the exact discrete ratio. It overshoots where dt · a · H is not small, which the guided step does not.
+    The weight is still the exact discrete ratio. It overshoots where dt · a · H is not small, which the guided step
+    does not.
     """
 
     guide: AbstractGuide
@@ -197,7 +203,6 @@ def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, S
     first = jax.tree.map(lambda a: a[0], steps)
     n = first.shift.shape[0]
     start = (seen.operator, jnp.zeros_like(apply(seen.operator, first.shift)))
-    M = jnp.zeros((), first.shift.dtype) if seen.factor is None else seen.covariance
 
     def back(carry, step):
         operator, shift, M = carry
@@ -206,10 +211,10 @@ def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, S
         carry = (compose(operator, step.operator), shift, M)
         return carry, carry
 
-    shapes = jax.eval_shape(lambda: back((*start, M), first)[0])
+    shapes = jax.eval_shape(lambda: back((*start, seen.covariance), first)[0])
     shapes = jax.eval_shape(lambda s: back(s, first)[0], shapes)
     operator = promote(seen.operator, len(shapes[0].shape), n)
-    carry = (operator, start[1], promote(M, len(shapes[2].shape), start[1].shape[0]))
+    carry = (operator, start[1], promote(seen.covariance, len(shapes[2].shape), start[1].shape[0]))
     return jax.lax.scan(back, carry, steps, reverse=True)[1]
 
 

@@ -11,8 +11,8 @@ of u given v. With A = Λσ, N Nᵀ = P Pᵀ + A Aᵀ and y = N⁻¹(v − s −
     μ = Aᵀ N⁻ᵀ y,      B = I − Aᵀ N⁻ᵀ (N + P)⁻¹ A,      |B| = |P|/|N|,      B⁻¹ = I + Aᵀ (N + P)⁻ᵀ P⁻¹ A
 
 (the square-root measurement update of Andrews 1968). Both factors are needed for the density in any case and all solves
-act on states, so no triangular solve with a matrix on the right, no k × k factorisation and no inverse of a is formed; with
-P = 0, an exact observation, B is the projection on the noises that the observation leaves free.
+act on states, so no triangular solve with a matrix on the right, no k × k factorisation and no inverse of a is formed;
+with P = 0, an exact observation, B is the projection on the noises that the observation leaves free.
 """
 
 import abc

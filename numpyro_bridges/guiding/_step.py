@@ -43,7 +43,7 @@ class GridNoise(diffrax.AbstractBrownianPath):
 
     def evaluate(self, t0, t1=None, left=True, use_levy=False):
         t1 = t0 if t1 is None else t1
-        dt, z = t1 - t0, self.noise[self.index(t0)]
+        dt, z = t1 - t0, self.noise[self.index(jnp.asarray(t0))]
         if not issubclass(self.levy_area, diffrax.SpaceTimeLevyArea):
             return jnp.sqrt(dt) * z
         z, area = jnp.split(z, 2)
@@ -52,7 +52,7 @@ class GridNoise(diffrax.AbstractBrownianPath):
 
 
 class GuidedTerm(diffrax.AbstractTerm):
-    """What `GuidedStep` steps: an SDE, a plan (`step(t0)` is its entry at the step's end), a value to be led to, noise."""
+    """What `GuidedStep` steps: an SDE, a plan (`step(t0)`: its entry at the step's end), the target, noise."""
 
     sde: AbstractSDE
     plan: AbstractPlan

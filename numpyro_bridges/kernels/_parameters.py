@@ -1,11 +1,12 @@
 """Parameters and points of kernels: what is checked when they come in, and again when they are used."""
 
 from collections.abc import Callable
+from functools import reduce
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import as_float, require, require_positive
+from .._checks import as_float, floating, require, require_positive
 
 
 def scalar(value: Array, name: str, dtype: jnp.dtype) -> Float[Array, ""]:
@@ -34,12 +35,6 @@ def positive_scalar(name: str) -> Callable[[ArrayLike], Float[Array, ""]]:
     return convert
 
 
-def floating(x: ArrayLike, name: str) -> Float[Array, "..."]:
-    """An array that keeps its precision; whole numbers become the default float type."""
-    keeps = jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)
-    return jnp.asarray(x) if keeps else as_float(x, name)
-
-
 def points(x: ArrayLike, name: str) -> Float[Array, "n dim"]:
     """Points, one a row."""
     x = floating(x, name)
@@ -58,7 +53,7 @@ def squared_distances(x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Flo
         f"`x` and `y` must hold points of one dimension; got shapes {x.shape} and {y.shape}.",
     )
     # one coordinate at a time: whole n × m arrays, and a derivative with none of shape (n, m, dim)
-    return sum(jnp.square(a[:, None] - b[None, :]) for a, b in zip(x.T, y.T, strict=True))
+    return reduce(jnp.add, (jnp.square(a[:, None] - b[None, :]) for a, b in zip(x.T, y.T, strict=True)))
 
 
 def squared_frequency(omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:

@@ -20,7 +20,7 @@ _MAX_LINEARISED = 64
 
 
 class Transition(eqx.Module):
-    """One step of the time-discretised model, x' = mean + factor u with u ~ N(0, I), where covariance = factor factorᵀ."""
+    """One step of the time-discretised model, x' = mean + factor u with u ~ N(0, I), covariance = factor factorᵀ."""
 
     mean: State
     factor: Structured
@@ -120,7 +120,7 @@ class AbstractSDE(eqx.Module):
     def terms(self, control: diffrax.AbstractPath) -> diffrax.MultiTerm:
         """diffrax terms, driven by `control` with values `(k, dim)`."""
         return diffrax.MultiTerm(
-            diffrax.ODETerm(lambda t, y, args: self.drift(t, y)), DiffusionTerm(self.diffusion, control)
+            diffrax.ODETerm(lambda t, y, args: self.drift(jnp.asarray(t), y)), DiffusionTerm(self.diffusion, control)
         )
 
     def check_state(self, x: State) -> None:

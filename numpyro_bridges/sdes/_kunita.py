@@ -49,16 +49,21 @@ class KunitaFlow(AbstractSDE):
         )
         if isinstance(noise, str):
             require(noise in NOISES, f"`noise` must be one of {sorted(NOISES)} or a noise object; got {noise!r}.")
-            noise = NOISES[noise]()
+            noise_field: AbstractNoise = NOISES[noise]()
+        else:
+            noise_field = noise
         require(
-            isinstance(space, Landmarks) or not isinstance(noise, LandmarkNoise),
+            isinstance(space, Landmarks) or not isinstance(noise_field, LandmarkNoise),
             '`noise="landmark"` is attached to landmarks, and the coefficients of a `FourierBasis` are none: '
             'their covariance has no points to be factored at. Use `noise="spectral"` or `noise="grid"`.',
         )
+        if kernel is not None:
+            covariance = kernel.convolved(space.dim)
+        assert covariance is not None  # one of the two is given
         self.space = space
         self.kernel = kernel
-        self.covariance_kernel = kernel.convolved(space.dim) if covariance is None else covariance
-        self.noise_field = noise
+        self.covariance_kernel = covariance
+        self.noise_field = noise_field
 
     def drift(self, t: RealScalar, x: State) -> State:
         return jnp.zeros_like(x)
@@ -97,6 +102,6 @@ class KunitaFlow(AbstractSDE):
             i, j = np.unravel_index(np.argmin(gap), gap.shape)
             require(
                 gap[i, j] > 1e-6 * np.ptp(value),
-                f"landmarks {min(i, j)} and {max(i, j)} coincide (distance {gap[i, j]:.1e}): they move as one point and "
-                'their covariance is singular. Remove one of them, or use `noise="spectral"`.',
+                f"landmarks {min(i, j)} and {max(i, j)} coincide (distance {gap[i, j]:.1e}): they move as one point "
+                'and their covariance is singular. Remove one of them, or use `noise="spectral"`.',
             )

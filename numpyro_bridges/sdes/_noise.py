@@ -7,6 +7,7 @@ error (grid).
 
 import abc
 import itertools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -160,4 +161,8 @@ class GridNoise(AbstractNoise):
         return kernel.matrix(points, cells) * jnp.sqrt(jnp.prod(width))
 
 
-NOISES = {"landmark": LandmarkNoise, "spectral": SpectralNoise, "grid": GridNoise}
+NOISES: dict[str, Callable[[], AbstractNoise]] = {
+    "landmark": LandmarkNoise,
+    "spectral": SpectralNoise,
+    "grid": GridNoise,
+}

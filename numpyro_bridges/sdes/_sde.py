@@ -24,6 +24,11 @@ class _Static(eqx.Module):
         return self.function(t, x, args)
 
 
+def _wrapped(f: Callable) -> Any:
+    """A module keeps its leaves; a plain function becomes static."""
+    return f if isinstance(f, eqx.Module) else _Static(f)
+
+
 class SDE(AbstractSDE):
     """dX = drift(t, X, args) dt + diffusion(t, X, args) dW, stepped by Euler–Maruyama.
 
@@ -48,8 +53,7 @@ class SDE(AbstractSDE):
                 raise ValueError(
                     f"`{name}` must be a function f(t, x, args); got {f!r}. Wrap it: `lambda t, x, args: ...`."
                 )
-        self.drift_function = drift if isinstance(drift, eqx.Module) else _Static(drift)
-        self.diffusion_function = diffusion if isinstance(diffusion, eqx.Module) else _Static(diffusion)
+        self.drift_function, self.diffusion_function = _wrapped(drift), _wrapped(diffusion)
         self.args = jax.tree.map(jnp.asarray, args)
         self.space = space
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import as_float, require
+from .._checks import floating, require
 
 
 class AbstractSpace(eqx.Module):
@@ -112,12 +112,6 @@ class AbstractSpace(eqx.Module):
             "use `jax.vmap`.",
         )
         return x
-
-
-def floating(x: ArrayLike, name: str) -> Float[Array, "..."]:
-    """An array that keeps its precision; whole numbers become the default float type."""
-    keeps = jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)
-    return jnp.asarray(x) if keeps else as_float(x, name)
 
 
 def equispaced(n: int) -> np.ndarray:
