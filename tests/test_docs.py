@@ -1,0 +1,97 @@
+"""The documentation: its code runs, its citations exist, and what is exported is documented."""
+
+import inspect
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import numpyro_bridges as nb
+
+pytestmark = pytest.mark.numpyro
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SOURCES = sorted((ROOT / "numpyro_bridges").rglob("*.py"))
+BIBLIOGRAPHY = (ROOT / "docs" / "references.bib").read_text(encoding="utf-8")
+ENTRIES = {key: body for key, body in re.findall(r"@\w+\{(\w+),\n(.*?)\n\}", BIBLIOGRAPHY, re.S)}
+
+RUN_BLOCKS = """
+import re, sys
+first, count, *paths = sys.argv[1:]
+pages = {path: open(path, encoding="utf-8").read() for path in paths}
+blocks = [(path, found) for path in paths for found in re.finditer(r"^```python\\n(.*?)^```", pages[path], re.S | re.M)]
+for path, found in blocks[int(first) :: int(count)]:
+    lines_before = pages[path][: found.start(1)].count("\\n")
+    exec(compile("\\n" * lines_before + found.group(1), path, "exec"), {"__name__": "__main__"})
+    print("ran the block at line", lines_before)
+"""
+
+
+def test_code_runs_as_it_stands(tmp_path):
+    """Every block by itself, in single precision as a user's process has it; an error names the line of the page.
+
+    Two processes share the blocks. The README's first page is run by test_examples.py.
+    """
+    pages = sorted((ROOT / "docs").glob("*.md"))
+    quick = {"OPENBLAS_NUM_THREADS": "1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "PYTHONPATH": str(ROOT)}
+    program = [sys.executable, "-W", "error::UserWarning", "-c", RUN_BLOCKS]
+    running = [
+        subprocess.Popen(
+            [*program, first, "2", *map(str, pages)],
+            cwd=tmp_path,
+            env=os.environ | quick,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for first in ("0", "1")
+    ]
+    printed = [process.communicate(timeout=300)[0] for process in running]
+    assert [process.returncode for process in running] == [0, 0], "\n".join(printed)
+    blocks = sum(page.read_text(encoding="utf-8").count("\n```python\n") for page in pages)
+    assert blocks >= 9 and "".join(printed).count("ran the block") == blocks
+
+
+def fields(body):
+    return dict(re.findall(r"^\s*(\w+)\s*=\s*\{(.*)\},?$", body, re.M))
+
+
+def test_bibliography_is_well_formed():
+    keys = re.findall(r"@\w+\{(\w+),", BIBLIOGRAPHY)
+    assert len(keys) == len(set(keys)) == len(ENTRIES)
+    for key, body in ENTRIES.items():
+        assert {"author", "title", "year"} <= set(fields(body)), key
+        assert fields(body)["year"] == key[-4:], key
+
+
+@pytest.mark.parametrize("path", [*PAGES, *SOURCES], ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_citations_exist(path):
+    """Keys, [@key], and names with a year, "Gower 1975" or "Mider, Schauer and van der Meulen (2021)"."""
+    text = path.read_text(encoding="utf-8")
+    for key in re.findall(r"\[@(\w+)\]", text):
+        assert key in ENTRIES, f"{key} is not in references.bib"
+    if "References" in text:
+        text = text[: text.rindex("References")]
+    for found in re.finditer(r"(?:\b[A-Z][\w’']+|\bal\.),? \(?((?:19|20)\d\d)\b", text):
+        before, year = text[max(found.start() - 60, 0) : found.end()], found.group(1)
+        authors = [fields(body)["author"] for body in ENTRIES.values() if fields(body)["year"] == year]
+        surnames = [author.split(",")[0] for names in authors for author in names.split(" and ")]
+        assert any(surname in before for surname in surnames), f"no entry of {year} for “{before[-40:]}”"
+
+
+def test_every_entry_is_cited():
+    text = "".join(path.read_text(encoding="utf-8") for path in [*PAGES, *SOURCES])
+    assert [key for key in ENTRIES if f"[@{key}]" not in text] == []
+
+
+def test_top_level_names_have_docstrings():
+    names = [name for name in vars(nb) if not name.startswith("_")]
+    assert {"GuidedBridge", "DiffusionEndpoint", "sample", "datasets"} <= set(names)
+    for name in names:
+        value = getattr(nb, name)
+        text = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+        assert text or re.fullmatch(r"[a-z]+", name) and inspect.ismodule(value), f"{name} has no docstring"
