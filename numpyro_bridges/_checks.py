@@ -33,6 +33,11 @@ def require(ok: Any, message: str) -> None:
         raise ValueError(message)
 
 
+def require_instance(value: Any, kind: type, name: str, cure: str) -> None:
+    """The value is of a class, whose name says what is meant."""
+    require(isinstance(value, kind), f"`{name}` must be {cure}; got {value!r}.")
+
+
 def require_finite(x: jax.Array, name: str, cure: str = "") -> None:
     """Every entry is finite, where that can be known."""
     value = concrete(x)

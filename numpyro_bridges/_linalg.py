@@ -5,10 +5,24 @@ map acts on every column, so no Kronecker product is ever formed. The rank is kn
 scalar or diagonal problem compiles to elementwise work.
 """
 
+import functools
+
+import jax
 import jax.numpy as jnp
 from jax import lax
 
 from ._types import State, Structured
+
+
+def full_precision(f):
+    """Products in `f` keep float32, where a GPU's default is a 10-bit mantissa (TF32): weights need every digit."""
+
+    @functools.wraps(f)
+    def wrapped(*args, **kwargs):
+        with jax.default_matmul_precision("highest"):
+            return f(*args, **kwargs)
+
+    return wrapped
 
 
 def _rows(d, x):

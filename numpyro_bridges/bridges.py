@@ -1,13 +1,17 @@
 """Guided bridges: an SDE conditioned on what is seen at a later time, as a function of standard normal noise."""
 
+import functools
+from collections.abc import Callable
+from typing import TypeVar, cast
+
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ._checks import as_float, concrete, require, require_finite
-from ._linalg import apply, congruence
+from ._checks import as_float, concrete, require, require_finite, require_instance
+from ._linalg import apply, congruence, full_precision, promote
 from ._types import RealScalar, State
 from .conditioning import AbstractCondition, Target
 from .guiding import (
@@ -25,6 +29,24 @@ from .guiding import (
     travel_continuous,
 )
 from .sdes import AbstractSDE
+
+Method = TypeVar("Method", bound=Callable)
+
+
+class _PureMethod:
+    """Binds to a partial function, which `jax.jit` takes as it is: equinox's bound methods hash their arrays."""
+
+    def __init__(self, method):
+        self.method, self.__doc__ = method, method.__doc__
+
+    def __get__(self, instance, owner=None):
+        if instance is None:
+            return self.method
+        return functools.update_wrapper(functools.partial(self.method, instance), self.method)
+
+
+def _pure_method(method: Method) -> Method:
+    return cast(Method, _PureMethod(method))
 
 
 class GuidedBridge(eqx.Module):
@@ -77,15 +99,19 @@ class GuidedBridge(eqx.Module):
             isinstance(condition, AbstractCondition),
             f"`condition` must be a condition, such as `InexactMatch(variance).at(v)`; got {type(condition).__name__}.",
         )
+        require_instance(sde, AbstractSDE, "sde", "an SDE, such as `LinearSDE(drift, diffusion)`")
         x0 = as_float(x0, "x0")
         require(
-            x0.ndim in (1, 2), f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Use vmap for a batch."
+            x0.ndim in (1, 2) and x0.size,
+            f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Use vmap for a batch.",
         )
         require_finite(x0, "x0")
         sde.check_state(x0)
         condition.check(sde, x0)
         if guide is None:
             guide = FrozenGuide() if sde.has_constant_covariance(x0) else RecedingGuide()
+        require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
+        guide.check(sde, x0)
         self.sde, self.condition, self.x0, self.guide = sde, condition, x0, guide
         self.ts = time_grid(t0, t1, num_steps, ts, graded=condition.exact)
         self.solver = GuidedStep() if solver is None else solver
@@ -102,7 +128,7 @@ class GuidedBridge(eqx.Module):
         )
         require(
             isinstance(self.solver, (diffrax.AbstractItoSolver, diffrax.AbstractStratonovichSolver)),
-            f"`solver` must be a solver for SDEs; got {name}.",
+            f"`solver` must be a diffrax solver for SDEs, such as `diffrax.Euler()`; got {self.solver!r}.",
         )
         if not self._is_discrete:
             seen, reference = self._end()
@@ -110,7 +136,8 @@ class GuidedBridge(eqx.Module):
             if self.condition.exact:
                 a = congruence(seen.operator, self.sde.covariance(self.ts[-1], reference))
                 a_aux = congruence(seen.operator, auxiliary.covariance(self.ts[-1], reference))
-                gap = jnp.max(jnp.abs(a - a_aux)) if a.ndim == a_aux.ndim else jnp.inf
+                ndim, m = max(a.ndim, a_aux.ndim), apply(seen.operator, reference).shape[0]
+                gap = jnp.max(jnp.abs(promote(a, ndim, m) - promote(a_aux, ndim, m)))
                 require(
                     gap <= 1e-5 * jnp.max(jnp.abs(a)),
                     "`auxiliary` must match the SDE at the observed end, L ã(T) Lᵀ = L a(T, v) Lᵀ, for the continuous "
@@ -128,8 +155,9 @@ class GuidedBridge(eqx.Module):
             scale = jnp.sqrt(jnp.max(jnp.abs(S)))
             require(
                 jnp.all(pivots > 1e-10 * scale),
-                "an exact match needs noise in every observed direction, and the covariance of the last step, L a Lᵀ dt"
-                ", is singular: an observed component has no noise of its own. Use `InexactMatch`, a small variance.",
+                "`condition` is an exact match, which needs noise in every observed direction, and the covariance of the "
+                "last step, L a Lᵀ dt, is singular: an observed component has no noise of its own. Use `InexactMatch` "
+                "with a small variance.",
             )
 
     @property
@@ -153,14 +181,17 @@ class GuidedBridge(eqx.Module):
         """The same bridge, led by another guide: the same estimand."""
         return GuidedBridge(self.sde, self.condition, x0=self.x0, ts=self.ts, guide=guide, solver=self.solver)
 
+    @_pure_method
     def path(self, noise: Float[Array, "K k dim"]) -> Float[Array, "K+1 n *dim"]:
         """The states at `ts`, the first being x0. Weighted by exp(log_weight(noise)) it has the conditioned law."""
         return self._run(noise)[0]
 
+    @_pure_method
     def log_weight(self, noise: Float[Array, "K k dim"]) -> Float[Array, ""]:
         """Ψ, log h̃(t0, x0) included. NaN after a numerical failure."""
         return self._run(noise)[1]
 
+    @_pure_method
     def path_and_log_weight(
         self, noise: Float[Array, "K k dim"]
     ) -> tuple[Float[Array, "K+1 n *dim"], Float[Array, ""]]:
@@ -192,6 +223,7 @@ class GuidedBridge(eqx.Module):
         reference = self.condition.reference(self.sde, free)
         return seen, reference
 
+    @full_precision
     def _message(self, t, x: State, observed: State):
         """The guide's forecast of what is seen from x at the grid time at or below t."""
         seen, reference = self._end()
@@ -209,16 +241,26 @@ class GuidedBridge(eqx.Module):
         message = self._message(self.ts[0], self.x0, jnp.zeros_like(apply(seen.operator, self.x0)))
         return self.condition.target(apply(message.operator, self.x0) + message.shift, message.factor, extra)
 
+    def _before_the_end(self, t, x) -> State:
+        """x, checked with t."""
+        x = as_float(x, "x")
+        require(x.shape == self.x0.shape, f"`x` must be one state, {self.x0.shape}; got shape {x.shape}. Use vmap.")
+        require(
+            jnp.all((t >= self.ts[0]) & (t < self.ts[-1])),
+            f"`t` must lie in [{self.ts[0]}, {self.ts[-1]}), before the end; got {t}.",
+        )
+        return x
+
     def log_h(self, t: RealScalar, x: State) -> Float[Array, ""]:
         """log h̃(t, x) of the guide, t before t1: log density of the datum, or log probability of the set, from x."""
-        x = as_float(x, "x")
+        x = self._before_the_end(t, x)
         seen = self.condition.observation(self.sde, x)
         message = self._message(t, x, jnp.zeros_like(apply(seen.operator, x)))
         return self.condition.log_value(apply(message.operator, x) + message.shift, message.factor) + seen.log_scale
 
     def score(self, t: RealScalar, x: State) -> State:
         """∇ log h̃(t, x), the guide's covariance held fixed: where the path is pulled, before a(x) acts on it."""
-        x = as_float(x, "x")
+        x = self._before_the_end(t, x)
         seen = self.condition.observation(self.sde, x)
         message = self._message(t, x, jnp.zeros_like(apply(seen.operator, x)))
         return jax.grad(lambda y: self.condition.log_value(apply(message.operator, y) + message.shift, message.factor))(
@@ -226,6 +268,7 @@ class GuidedBridge(eqx.Module):
         )
 
     @eqx.filter_jit
+    @full_precision
     def _run(self, noise):
         extra, noise = self._split(noise)
         seen, reference = self._end()
@@ -242,6 +285,7 @@ class GuidedBridge(eqx.Module):
         return jnp.concatenate([self.x0[None], path]), log_weight + target.log_weight
 
     @eqx.filter_jit
+    @full_precision
     def noise_from_path(
         self, path: Float[Array, "K+1 n *dim"], key: PRNGKeyArray | None = None
     ) -> Float[Array, "K k dim"]:

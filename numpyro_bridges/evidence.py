@@ -6,7 +6,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from . import weights
-from ._checks import require
+from ._checks import require, require_instance
 from .bridges import GuidedBridge
 
 
@@ -45,6 +45,10 @@ def estimate_evidence(
     require(
         isinstance(num_particles, int) and num_particles >= 2,
         f"`num_particles` must be an integer of at least 2; got {num_particles!r}.",
+    )
+    require_instance(bridge, GuidedBridge, "bridge", "a `GuidedBridge`")
+    require(
+        isinstance(batch_size, int) and batch_size >= 1, f"`batch_size` must be a positive integer; got {batch_size!r}."
     )
     log_weights = _log_weights(bridge, jr.split(key, num_particles), min(batch_size, num_particles))
     return EvidenceEstimate(

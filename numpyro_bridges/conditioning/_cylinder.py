@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from .._checks import as_float, concrete, require
+from .._checks import as_float, concrete, require, require_finite
 from .._linalg import promote
 from .._types import State, Structured
 from ..sdes import AbstractSDE
@@ -48,16 +48,25 @@ class CylinderSet(AbstractCondition):
 
     def __init__(self, lower, upper):
         lower, upper = as_float(lower, "lower"), as_float(upper, "upper")
+        shapes = lower.shape, upper.shape
+        require(
+            shapes[0] == shapes[1] or () in shapes,
+            f"`lower` and `upper` must have one shape, or one of them be a scalar; got {shapes[0]} and {shapes[1]}.",
+        )
         lower, upper = jnp.broadcast_arrays(lower, upper)
         require(lower.ndim >= 1, "`lower` and `upper` must have one row per coordinate, (N,) or (N, dim); got scalars.")
         low, high = concrete(lower), concrete(upper)
         if low is not None and high is not None:
             require(
                 not (np.isnan(low).any() or np.isnan(high).any()),
-                "`lower` and `upper` must not be NaN; use ±inf for a free side.",
+                f"`lower` and `upper` must not be NaN; got {low} and {high}. Use ±inf for a free side.",
             )
             bad = ~((low <= high) & (low < np.inf) & (high > -np.inf))
-            require(not bad.any(), f"`lower` must not exceed `upper`: the set is empty in {int(bad.sum())} entries.")
+            require(
+                not bad.any(),
+                f"`lower` must not exceed `upper`, or the set is empty; got {low[bad][:1]} above {high[bad][:1]} in "
+                f"{int(bad.sum())} entries. Exchange them.",
+            )
             seen = (np.isfinite(low) | np.isfinite(high)).reshape(len(low), -1).any(1)
             rows = np.flatnonzero(seen) if seen.any() else np.arange(1)
         else:
@@ -159,14 +168,16 @@ class IntervalCensored(AbstractMatch):
             self.cuts.ndim == 1 and self.cuts.size >= 1,
             f"`cuts` must be a vector of cut points; got shape {self.cuts.shape}.",
         )
-        require(value is None or np.all(np.diff(value) > 0), "`cuts` must increase.")
+        require_finite(self.cuts, "cuts", "The outer bins are open without it.")
+        require(value is None or np.all(np.diff(value) > 0), f"`cuts` must increase; got {value}. Sort them.")
 
     def at(self, observed) -> AbstractCondition:
-        bins = jnp.asarray(observed)
+        bins = as_float(observed, "observed")
         value = concrete(bins)
         require(
             value is None or np.all((value == np.round(value)) & (value >= 0) & (value <= self.cuts.size)),
-            f"`observed` must hold bin numbers from 0 to {self.cuts.size}; got values outside.",
+            f"`observed` must hold bin numbers from 0 to {self.cuts.size}; got {value}. Values are put into bins by "
+            "`numpy.searchsorted(cuts, values)`.",
         )
         bins = bins.astype(int)
         infinity = jnp.full((1,), jnp.inf, self.cuts.dtype)

@@ -3,13 +3,14 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray
 
-from .._checks import as_float, concrete, require, require_finite, require_positive
+from .._checks import as_float, concrete, require, require_finite, require_instance, require_positive
 from .._linalg import apply, cholesky, columns, congruence, solve_lower
 from .._types import State, Structured
 from ..sdes import AbstractSDE
@@ -45,6 +46,7 @@ class _Seen(AbstractCondition):
             f"`observed` must have shape {shape} for a state {x.shape}; got {self.observed.shape}. "
             "Several observations need a batch: `vmap`, or a plate with one noise each.",
         )
+        jax.eval_shape(lambda: self.match.observation(sde, x))
 
     def observation(self, sde, x):
         return self.match.observation(sde, x)
@@ -82,7 +84,9 @@ class ExactMatch(AbstractMatch):
             keep = concrete(mask)
             if keep is None:
                 raise ValueError("`mask` of an exact match must be known when the program is traced; use InexactMatch.")
-            operator = np.eye(len(keep))[np.asarray(keep, bool)]
+            keep = _mask(keep)
+            require(keep.any(), "`mask` must leave at least one row to be seen; got all False.")
+            operator = np.eye(len(keep))[keep]
         self.operator = _operator(operator)
 
     def at(self, observed) -> AbstractCondition:
@@ -131,6 +135,13 @@ class InexactMatch(AbstractMatch):
     ):
         require(operator is None or mask is None, "Give `operator` or `mask`, not both.")
         self.variance = as_float(variance, "variance")
+        shape = self.variance.shape
+        require(
+            len(shape) < 2 or shape == shape[:1] * 2,
+            f"`variance` must be a number, (m,) or a matrix (m, m); got shape {shape}.",
+        )
+        if space is not None:
+            require_instance(space, AbstractSpace, "space", "a space, whose weights to use, or left out")
         if self.variance.ndim < 2:
             require_positive(self.variance, "variance", "For an observation without noise use ExactMatch.")
         elif concrete(self.variance) is not None:
@@ -140,7 +151,7 @@ class InexactMatch(AbstractMatch):
                 "`variance` must be a symmetric, positive definite matrix; its Cholesky factorisation fails. "
                 "Observe fewer combinations, or add a small multiple of the identity.",
             )
-        self.mask = None if mask is None else jnp.asarray(mask, bool)
+        self.mask = None if mask is None else _mask(mask)
         self.operator = _operator(operator)
         self.selected = _selection(self.operator)
         self.space = space
@@ -150,7 +161,8 @@ class InexactMatch(AbstractMatch):
     def from_point_sd(cls, sd, space: AbstractSpace, **kwargs) -> "InexactMatch":
         """From the standard deviation of one coordinate of one point (of average weight): variance = sd² · mean(w)."""
         sd = as_float(sd, "sd")
-        require_positive(sd, "sd")
+        require_positive(sd, "sd", "For an observation without noise use ExactMatch.")
+        require_instance(space, AbstractSpace, "space", "a space, whose weights say how far a point counts")
         return cls(sd**2 * jnp.mean(space.weights), space=space, **kwargs)
 
     def at(self, observed) -> AbstractCondition:
@@ -228,6 +240,17 @@ def _operator(operator) -> Structured:
         "Remove repeated observations.",
     )
     return operator
+
+
+def _mask(mask) -> Array:
+    """Which rows are seen, as booleans."""
+    value = concrete(mask)
+    require(jnp.ndim(mask) == 1, f"`mask` must be a vector (n,), one entry for each row; got shape {jnp.shape(mask)}.")
+    require(
+        value is None or np.all((value == 0) | (value == 1)),
+        f"`mask` must hold booleans, True where a row is seen; got {value}.",
+    )
+    return jnp.asarray(mask, bool) if value is None else jnp.asarray(value.astype(bool))
 
 
 def _selection(operator: Structured) -> tuple[int, ...] | None:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._linalg import cholesky, diagonal_matrix, solve_lower
+from .._linalg import cholesky, diagonal_matrix, full_precision, solve_lower
 
 
 @jax.custom_vjp
@@ -38,6 +38,7 @@ def _forward(A, S, M, r, z):
     return (z + A.T @ w, log_det), (A, N, P, z, y, g, w)
 
 
+@full_precision
 def _backward(residuals, cotangents):
     A, N, P, z, y, g, w = residuals
     u_bar, log_det_bar = cotangents

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import as_float, require, require_finite
+from .._checks import as_float, concrete, require, require_finite
 from .._types import RealScalar
 
 
@@ -13,20 +13,29 @@ def time_grid(
 ) -> Float[Array, " K+1"]:
     """The user's grid, checked, or the default one: uniform, or graded towards t1 as t = s(2 − s/T)."""
     if ts is not None:
-        require(num_steps is None, "Give `num_steps` or `ts`, not both.")
+        require(num_steps is None, f"Give `num_steps` or `ts`, not both; got num_steps = {num_steps}.")
         ts = as_float(ts, "ts")
         require(
             ts.ndim == 1 and ts.shape[0] >= 2, f"`ts` must be a vector of at least two times; got shape {ts.shape}."
         )
         require_finite(ts, "ts")
-        require(jnp.all(jnp.diff(ts) > 0), "`ts` must increase strictly. Sort it and remove repeated times.")
+        require(
+            jnp.all(jnp.diff(ts) > 0),
+            f"`ts` must increase strictly; a step has length {concrete(jnp.min(jnp.diff(ts)))}. Sort it and remove "
+            "repeated times.",
+        )
         require(
             t1 is None or jnp.abs(ts[-1] - t1) <= 1e-5 * jnp.abs(ts[-1] - ts[0]),
-            f"`ts` must end at `t1`; got {t1} and {ts[-1]}.",
+            f"`ts` must end at `t1`; got ts[-1] = {ts[-1]} and t1 = {t1}. Give only `ts`.",
+        )
+        begin = concrete(t0)  # 0, the default, says nothing
+        require(
+            begin is None or np.all(begin == 0) or jnp.abs(ts[0] - t0) <= 1e-5 * jnp.abs(ts[-1] - ts[0]),
+            f"`ts` must begin at `t0`; got ts[0] = {ts[0]} and t0 = {t0}. Give only `ts`.",
         )
         return ts
     if t1 is None or num_steps is None:
-        raise ValueError("Give `t1` and `num_steps`, or a grid `ts`.")
+        raise ValueError(f"Give `t1` and `num_steps`, or a grid `ts`; got t1 = {t1}, num_steps = {num_steps}.")
     require(
         isinstance(num_steps, (int, np.integer)) and not isinstance(num_steps, bool) and num_steps >= 1,
         f"`num_steps` must be a positive integer; got {num_steps!r}.",

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._checks import as_float, require
+from .._checks import as_float, require, require_instance
 from .._linalg import add, apply, cholesky, compose, congruence, promote
 from .._types import RealScalar, State, Structured
 from ..conditioning import GaussianMessage, Observation
@@ -48,6 +48,10 @@ class AbstractGuide(eqx.Module):
     @abc.abstractmethod
     def plan(self, sde: AbstractSDE, seen: Observation, reference: State, ts) -> AbstractPlan:
         """Prepare for a grid `ts` `(K + 1,)`. `reference` is a state that meets the condition."""
+
+    def check(self, sde: AbstractSDE, x: State) -> None:
+        """`ValueError` where the guide does not fit states shaped like x."""
+        return None
 
     def auxiliary_process(self, sde: AbstractSDE, reference: State, t1: RealScalar) -> LinearSDE:
         """The linear process whose h̃ is an exact h-transform, for the continuous-time weight."""
@@ -88,6 +92,13 @@ class FrozenGuide(AbstractGuide):
             f"got {type(auxiliary).__name__}.",
         )
         self.auxiliary = auxiliary
+
+    def check(self, sde, x):
+        if self.auxiliary is not None:
+            try:
+                self.auxiliary.check_state(x)
+            except ValueError as e:
+                raise ValueError(f"`auxiliary` must have the states of the SDE, {x.shape}: {e}") from e
 
     def plan(self, sde, seen, reference, ts):
         return _FrozenPlan(backward_filter(self._steps(sde, reference, ts), seen))
@@ -178,6 +189,12 @@ class DriftGuide(AbstractGuide):
     """
 
     guide: AbstractGuide
+
+    def __check_init__(self):
+        require_instance(self.guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
+
+    def check(self, sde, x):
+        self.guide.check(sde, x)
 
     def plan(self, sde, seen, reference, ts):
         plan = self.guide.plan(sde, seen, reference, ts)

@@ -11,7 +11,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._linalg import add, apply
+from .._checks import floating, require
+from .._linalg import add, apply, columns, full_precision
 from .._types import Noise, RealScalar, State, Structured
 from ..spaces import AbstractSpace
 
@@ -139,6 +140,7 @@ class AbstractSDE(eqx.Module):
             )
 
 
+@full_precision
 def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
     """A path of the model, unconditioned.
 
@@ -146,6 +148,17 @@ def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
 
     **Returns:** `(K + 1, n, dim)`, the first state being `x0`.
     """
+    x0, ts = floating(x0, "x0"), floating(ts, "ts")
+    sde.check_state(x0)
+    require(ts.ndim == 1 and ts.size >= 2, f"`ts` must be a vector of at least two times; got shape {ts.shape}.")
+    require(jnp.all(jnp.diff(ts) > 0), "`ts` must increase strictly. Sort it and remove repeated times.")
+    shape = (ts.shape[0] - 1, sde.noise_size(x0), columns(x0))
+    allowed = (shape, shape[:2]) if x0.ndim == 1 else (shape,)
+    require(
+        jnp.shape(noise) in allowed,
+        f"`noise` must have shape {shape}, one row per step; got {jnp.shape(noise)}. Use vmap for a batch.",
+    )
+    noise = jnp.asarray(noise)
 
     def step(x, inputs):
         t0, t1, z = inputs

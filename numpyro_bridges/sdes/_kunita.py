@@ -5,10 +5,11 @@ The covariance of two points is a(x, x') = ∫ k(x, y) k(x', y) dy, for the Gaus
 Sommer, Schauer, van der Meulen (2021), and Baker et al. (2024), section 2.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._checks import concrete, require
+from .._checks import concrete, require, require_instance
 from .._types import RealScalar, State, Structured
 from ..kernels import AbstractKernel
 from ..spaces import AbstractSpace, Landmarks
@@ -25,7 +26,7 @@ class KunitaFlow(AbstractSDE):
       points and projected.
     - `kernel`: k, which is convolved with itself; or
     - `covariance`: the covariance function a itself (some of the literature writes its kernel there).
-    - `noise`: `"landmark"` (default on landmarks), `"spectral"` (default on a basis), `"grid"`, or a `LandmarkNoise`,
+    - `noise`: `"landmark"` (for landmarks only), `"spectral"`, `"grid"`, or a `LandmarkNoise`,
       `SpectralNoise`, `GridNoise` with its own settings.
     """
 
@@ -47,10 +48,15 @@ class KunitaFlow(AbstractSDE):
             "Give either `kernel`, which is convolved with itself, or `covariance`, the covariance function itself; "
             f"got {'both' if kernel is not None else 'neither'}.",
         )
+        require_instance(space, AbstractSpace, "space", "a space, such as `Landmarks(num_points, dim)`")
+        for name, k in (("kernel", kernel), ("covariance", covariance)):
+            if k is not None:
+                require_instance(k, AbstractKernel, name, "a kernel, such as `GaussianKernel(amplitude, length_scale)`")
         if isinstance(noise, str):
             require(noise in NOISES, f"`noise` must be one of {sorted(NOISES)} or a noise object; got {noise!r}.")
             noise_field: AbstractNoise = NOISES[noise]()
         else:
+            require_instance(noise, AbstractNoise, "noise", f"one of {sorted(NOISES)} or a noise object")
             noise_field = noise
         require(
             isinstance(space, Landmarks) or not isinstance(noise_field, LandmarkNoise),
@@ -95,13 +101,14 @@ class KunitaFlow(AbstractSDE):
 
     def check_state(self, x: State) -> None:
         shape = (self.space.size, self.space.dim)
-        require(x.shape == shape, f"a state of this `space` must have shape {shape}; got {x.shape}.")
+        require(x.shape == shape, f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}.")
+        jax.eval_shape(self.noise, 0.0, x)
         value = concrete(x)
         if value is not None and isinstance(self.noise_field, LandmarkNoise) and len(value) > 1:
             gap = np.linalg.norm(value[:, None] - value[None], axis=-1) + np.where(np.eye(len(value)), np.inf, 0)
             i, j = np.unravel_index(np.argmin(gap), gap.shape)
             require(
                 gap[i, j] > 1e-6 * np.ptp(value),
-                f"landmarks {min(i, j)} and {max(i, j)} coincide (distance {gap[i, j]:.1e}): they move as one point "
+                f"`x0` must have distinct landmarks; {min(i, j)} and {max(i, j)} coincide (distance {gap[i, j]:.1e}): they move as one point "
                 'and their covariance is singular. Remove one of them, or use `noise="spectral"`.',
             )

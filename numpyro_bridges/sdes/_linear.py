@@ -26,11 +26,11 @@ def _phi1(x: Array) -> Array:
 
 
 def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array, Array, Array]:
-    """e^{Bτ}, ∫₀^τ e^{Bu} β du and ∫₀^τ e^{Bu} a e^{Bᵀu} du at τ = dt, by Taylor series at τ = dt/2^k, then k doublings.
+    """e^{Bτ}, ∫₀^τ e^{Bu} β du and ∫₀^τ e^{Bu} a e^{Bᵀu} du at τ = dt: Taylor series at dt/2^k, then k doublings.
 
-    k is such that the series are short. The block exponential of Van Loan (1978) holds e^{−Bτ} beside e^{Bτ} and loses the
-    covariance of a stiff equation to cancellation: 0.1 at Bτ = 40. Each doubling is a sum of covariances. Doubling e^{Bτ} − 1
-    keeps the digits that e^{Bτ} would lose in small steps. NaN for Bτ beyond 2^20.
+    The block exponential of Van Loan (1978) holds e^{−Bτ} beside e^{Bτ} and loses the covariance of a stiff equation to
+    cancellation, 0.1 at Bτ = 40; a doubling is a sum of covariances. To double e^{Bτ} − 1 keeps the digits that e^{Bτ}
+    would lose in small steps. NaN where Bτ is beyond 2^20.
     """
     one = jnp.ones((), B.dtype)
     norm = jnp.max(jnp.sum(jnp.abs(B), axis=0)) * dt
@@ -133,6 +133,22 @@ class LinearSDE(AbstractSDE):
         B = self.drift_operator
         require(B.ndim < 2 or B.shape[0] == B.shape[1], f"`drift` must be square; got shape {B.shape}.")
 
+    def check_state(self, x: State) -> None:
+        n = x.shape[0]
+        for name, A, full in (
+            ("drift", self.drift_operator, f"({n}, {n})"),
+            ("diffusion", self.diffusion_operator, f"({n}, k)"),
+        ):
+            require(
+                A.ndim == 0 or A.shape[0] == n,
+                f"`{name}` must be a scalar, a diagonal ({n},) or a matrix {full} for a state {x.shape}; got shape "
+                f"{A.shape}. A parameter with a batch axis does this too: vmap over it.",
+            )
+        require(
+            self.shift.shape in ((), (n,), x.shape),
+            f"`shift` must be a scalar, ({n},) or shaped like the state, {x.shape}; got shape {self.shift.shape}.",
+        )
+
     def drift(self, t: RealScalar, x: State) -> State:
         return apply(self.drift_operator, x) + as_state_shift(self.shift, x)
 
@@ -191,6 +207,11 @@ def _covariance(value, name: str) -> Array:
     )
     if concrete(Q) is not None:
         factor = cholesky(Q)
+        require(
+            Q.ndim < 2 or jnp.allclose(Q, Q.T),
+            f"`{name}` must be symmetric; it differs from its transpose by {concrete(jnp.max(jnp.abs(Q - Q.T)))}. "
+            "Give the covariance, no factor of it.",
+        )
         require(
             jnp.all(jnp.isfinite(factor)) & jnp.all((factor if Q.ndim < 2 else jnp.diagonal(factor)) > 0),
             f"`{name}` must be positive definite; its Cholesky factorisation fails. Remove duplicated points, or add a "

@@ -7,6 +7,7 @@ error (grid).
 
 import abc
 import itertools
+from typing import Any
 from collections.abc import Callable
 
 import equinox as eqx
@@ -17,6 +18,12 @@ from jaxtyping import Array, Float
 from .._checks import as_float, require, require_finite, require_positive
 from .._linalg import add, cholesky
 from ..kernels import AbstractKernel
+
+
+def _positive_integer(value: Any, name: str) -> int:
+    good = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
+    require(good, f"`{name}` must be a positive integer; got {value!r}.")
+    return int(value)
 
 
 class AbstractNoise(eqx.Module):
@@ -49,6 +56,11 @@ class LandmarkNoise(AbstractNoise):
 
     def __init__(self, jitter=None):
         self.jitter = None if jitter is None else as_float(jitter, "jitter")
+        if self.jitter is not None:
+            require(
+                self.jitter.ndim == 0 and jnp.isfinite(self.jitter) & (self.jitter >= 0),
+                f"`jitter` must be a number from 0 on, relative to the variance; got {jitter}. 1e-6 is large.",
+            )
 
     def factor(self, kernel, covariance, points):
         return self.factor_and_covariance(kernel, covariance, points)[0]
@@ -83,13 +95,13 @@ class SpectralNoise(AbstractNoise):
     fixed_in_space = True
 
     def __init__(self, num_modes: int = 12, period=None, diameter=4.0):
-        require(int(num_modes) >= 1, f"`num_modes` must be at least 1; got {num_modes}.")
-        self.num_modes = int(num_modes)
+        self.num_modes = _positive_integer(num_modes, "num_modes")
         self.period = None if period is None else as_float(period, "period")
         self.diameter = as_float(diameter, "diameter")
-        require_positive(self.diameter, "diameter")
+        require_positive(self.diameter, "diameter", "Give the largest distance of two points that is expected.")
         if self.period is not None:
             require_positive(self.period, "period", "Give the side of a box that the shapes stay well inside.")
+            require(self.period.ndim == 0, f"`period` must be one number for all axes; got shape {self.period.shape}.")
 
     def _period(self, kernel):
         if self.period is not None:
@@ -146,8 +158,7 @@ class GridNoise(AbstractNoise):
         require_finite(self.lower, "lower")
         require_finite(self.upper, "upper")
         require(jnp.all(self.lower < self.upper), f"`lower` must be below `upper`; got {lower} and {upper}.")
-        require(int(num_cells) >= 1, f"`num_cells` must be at least 1; got {num_cells}.")
-        self.num_cells = int(num_cells)
+        self.num_cells = _positive_integer(num_cells, "num_cells")
 
     def factor(self, kernel, covariance, points):
         if kernel is None:
@@ -155,6 +166,11 @@ class GridNoise(AbstractNoise):
                 '`noise="grid"` needs the flow\'s `kernel`; with `covariance=` use "landmark" or "spectral".'
             )
         dim = points.shape[1]
+        corners = {self.lower.shape, self.upper.shape}
+        require(
+            corners <= {(), (dim,)},
+            f"`lower` and `upper` must be numbers or corners ({dim},) of a box; got shapes {sorted(corners)}.",
+        )
         width = jnp.broadcast_to((self.upper - self.lower) / self.num_cells, (dim,))
         index = np.array(list(itertools.product(range(self.num_cells), repeat=dim)), float) + 0.5
         cells = jnp.broadcast_to(self.lower, (1, dim)) + jnp.asarray(index, points.dtype) * width[None]

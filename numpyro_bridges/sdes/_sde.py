@@ -1,5 +1,6 @@
 """A user's own SDE, from functions with diffrax's signature."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jax.extend.core import Literal
 
+from .._checks import require
 from .._linalg import compose, transpose
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
@@ -53,8 +55,12 @@ class SDE(AbstractSDE):
                 raise ValueError(
                     f"`{name}` must be a function f(t, x, args); got {f!r}. Wrap it: `lambda t, x, args: ...`."
                 )
+            require(
+                _takes_three(f),
+                f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add those it has no use for.",
+            )
         self.drift_function, self.diffusion_function = _wrapped(drift), _wrapped(diffusion)
-        self.args = jax.tree.map(jnp.asarray, args)
+        self.args = jax.tree.map(lambda leaf: _parameter(leaf), args)
         self.space = space
 
     def drift(self, t: RealScalar, x: State) -> State:
@@ -65,10 +71,34 @@ class SDE(AbstractSDE):
         if isinstance(sigma, lx.AbstractLinearOperator):
             sigma = lx.diagonal(sigma) if lx.is_diagonal(sigma) else sigma.as_matrix()
         sigma = jnp.asarray(sigma, x.dtype)
+        require(
+            sigma.ndim <= 2,
+            f"`diffusion` must return a scalar, a diagonal (n,) or a matrix (n, k); got shape {sigma.shape}.",
+        )
         return sigma, compose(sigma, transpose(sigma))
 
     def has_constant_covariance(self, x: State) -> bool:
         return not depends_on(lambda y: self.noise(0.0, y)[0], x)
+
+
+def _parameter(leaf: Any) -> jax.Array:
+    """A leaf of `args` as an array, its type kept."""
+    try:
+        return jnp.asarray(leaf)
+    except TypeError as e:
+        raise ValueError(
+            f"`args` must hold numbers and arrays, the parameters; got {leaf!r}. Let the function itself hold the rest."
+        ) from e
+
+
+def _takes_three(f: Callable) -> bool:
+    try:
+        inspect.signature(f).bind(None, None, None)
+    except TypeError:
+        return False
+    except ValueError:  # it does not tell
+        pass
+    return True
 
 
 def depends_on(f: Callable, x: State) -> bool:
