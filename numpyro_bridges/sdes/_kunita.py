@@ -93,11 +93,7 @@ class KunitaFlow(AbstractSDE):
     def noise_error(self) -> dict:
         """What a spectral representation leaves out, relative to a(x, x); empty for the others."""
         error = getattr(self.noise_field, "error", None)
-        return (
-            {}
-            if error is None
-            else error(self.kernel or self.covariance_kernel, self.covariance_kernel, self.space.dim)
-        )
+        return {} if error is None else error(self.kernel, self.covariance_kernel, self.space.dim)
 
     def check_state(self, x: State) -> None:
         shape = (self.space.size, self.space.dim)
@@ -109,6 +105,7 @@ class KunitaFlow(AbstractSDE):
             i, j = np.unravel_index(np.argmin(gap), gap.shape)
             require(
                 gap[i, j] > 1e-6 * np.ptp(value),
-                f"`x0` must have distinct landmarks; {min(i, j)} and {max(i, j)} coincide (distance {gap[i, j]:.1e}): they move as one point "
-                'and their covariance is singular. Remove one of them, or use `noise="spectral"`.',
+                f"`x0` must have distinct landmarks; {min(i, j)} and {max(i, j)} coincide (distance {gap[i, j]:.1e}): "
+                "they move as one point and their covariance is singular. Remove one of them, or use "
+                '`noise="spectral"`.',
             )

@@ -7,8 +7,8 @@ error (grid).
 
 import abc
 import itertools
-from typing import Any
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -103,12 +103,14 @@ class SpectralNoise(AbstractNoise):
             require_positive(self.period, "period", "Give the side of a box that the shapes stay well inside.")
             require(self.period.ndim == 0, f"`period` must be one number for all axes; got shape {self.period.shape}.")
 
-    def _period(self, kernel):
+    def _period(self, kernel, covariance):
         if self.period is not None:
             return self.period
-        if not hasattr(kernel, "length_scale"):
+        known = covariance if kernel is None else kernel
+        if not hasattr(known, "length_scale"):
             raise ValueError("`period` must be given to SpectralNoise: this kernel has no single length scale.")
-        return self.diameter + 8.6 * kernel.length_scale
+        length_scale = known.length_scale / jnp.sqrt(2.0) if kernel is None else known.length_scale
+        return self.diameter + 8.6 * length_scale
 
     def _lattice(self, dim: int) -> np.ndarray:
         """One of each pair ±ω, the origin first."""
@@ -118,7 +120,7 @@ class SpectralNoise(AbstractNoise):
 
     def factor(self, kernel, covariance, points):
         dim = points.shape[1]
-        period = self._period(kernel)
+        period = self._period(kernel, covariance)
         omega = jnp.asarray(self._lattice(dim), points.dtype) * (2 * jnp.pi / period)
         scale = jnp.sqrt(covariance.spectral_density(omega, dim) / period**dim)
         scale = jnp.concatenate([scale[:1], jnp.sqrt(2.0) * scale[1:]])
@@ -128,7 +130,7 @@ class SpectralNoise(AbstractNoise):
     def error(self, kernel, covariance, dim: int) -> dict[str, Array]:
         """What the representation leaves out, relative to a(x, x): the truncated `tail` (variance missing at a point)
         and the `wrap_around` (covariance with the nearest periodic image, at the given diameter)."""
-        period = self._period(kernel)
+        period = self._period(kernel, covariance)
         origin = jnp.zeros((1, dim))
         variance = covariance.matrix(origin, origin)[0, 0]
         factor = self.factor(kernel, covariance, origin)
