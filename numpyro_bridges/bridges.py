@@ -155,9 +155,9 @@ class GuidedBridge(eqx.Module):
             scale = jnp.sqrt(jnp.max(jnp.abs(S)))
             require(
                 jnp.all(pivots > 1e-10 * scale),
-                "`condition` is an exact match, which needs noise in every observed direction, and the covariance of the "
-                "last step, L a Lᵀ dt, is singular: an observed component has no noise of its own. Use `InexactMatch` "
-                "with a small variance.",
+                "`condition` is an exact match, which needs noise in every observed direction, and the covariance of "
+                "the last step, L a Lᵀ dt, is singular: an observed component has no noise of its own. Use "
+                "`InexactMatch` with a small variance.",
             )
 
     @property

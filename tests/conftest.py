@@ -40,6 +40,14 @@ def _promotion(request):
         yield
 
 
+@pytest.fixture(scope="module")
+def compile_quickly():
+    """For modules of many small programs that run once: `pytestmark = pytest.mark.usefixtures("compile_quickly")`."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture
 def key(request):
     """A random key, for identities that hold for every key. A failure shows its seed."""

@@ -78,8 +78,8 @@ class CylinderSet(AbstractCondition):
         n = x.shape[0]
         require(
             max(self.rows) < n and self.lower.shape[1:] == x.shape[1:],
-            f"`lower` and `upper` must have shape (N, *{x.shape[1:]}) with N ≤ {n} for a state {x.shape}; "
-            f"got {self.lower.shape} constrained rows up to row {max(self.rows)}.",
+            f"`lower` and `upper` must have a row for each of at most {n} rows of a state {x.shape}, (N, dim) or (N,) "
+            f"like it; got rows of shape {self.lower.shape[1:]}, the last not free being number {max(self.rows)}.",
         )
 
     def observation(self, sde, x):

@@ -245,7 +245,8 @@ def _operator(operator) -> Structured:
 def _mask(mask) -> Array:
     """Which rows are seen, as booleans."""
     value = concrete(mask)
-    require(jnp.ndim(mask) == 1, f"`mask` must be a vector (n,), one entry for each row; got shape {jnp.shape(mask)}.")
+    shape = np.shape(mask) if value is None else value.shape
+    require(len(shape) == 1, f"`mask` must be a vector (n,), one entry for each row; got shape {shape}.")
     require(
         value is None or np.all((value == 0) | (value == 1)),
         f"`mask` must hold booleans, True where a row is seen; got {value}.",

@@ -57,7 +57,7 @@ class SDE(AbstractSDE):
                 )
             require(
                 _takes_three(f),
-                f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add those it has no use for.",
+                f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add those it does without.",
             )
         self.drift_function, self.diffusion_function = _wrapped(drift), _wrapped(diffusion)
         self.args = jax.tree.map(lambda leaf: _parameter(leaf), args)
