@@ -83,10 +83,9 @@ def test_an_sde_is_its_process(name, key):
     assert sde.has_constant_covariance(x) == (name in CONSTANT or name == "user-time")
 
 
-@pytest.mark.parametrize("name", ["user-wide", "user-planar"])
-def test_diffrax_solves_it(name, key):
+def test_diffrax_solves_it(key):
     """`terms` in `diffrax.diffeqsolve`, and on the same noise `simulate`: both step by Euler–Maruyama."""
-    sde, _, x0 = SDES[name]()
+    sde, _, x0 = SDES["user-planar"]()
     x, ts = jnp.asarray(x0), jnp.linspace(0.0, 1.0, 6)
     z = jr.normal(key, (5, sde.noise_size(x), *x0.shape[1:]))
 
