@@ -1,8 +1,8 @@
 """The reference values: closed forms, and long runs by other means of nonlinear bridges.
 
-Closed forms are typed here again and agree with the printed digits of the table. Where the value is that of the continuous
-process and the model takes Euler steps, a test states its allowance for the discretisation, in units of 1/num_steps, and
-runs at two numbers of steps, one twice the other.
+Closed forms are typed here again and agree with the printed digits of the table. Where the value is that of the
+continuous process and the model takes Euler steps, a test states its allowance for the discretisation, in units of
+1/num_steps, and runs at two numbers of steps, one twice the other.
 """
 
 from dataclasses import dataclass
@@ -147,8 +147,10 @@ def sd(log_density):
 
 @pytest.mark.parametrize("n, shrunk", [(16, 0.046), (64, 0.037), (256, 0.031)])
 def test_spread_of_the_amplitude(curve_evidence, n, shrunk):
-    """With the H-norm the same posterior for every n; with a fixed variance per landmark it shrinks. The flat prior is that
-    on α > 0: an interval that leaves out α < 0.001 gives 0.1015."""
+    """With the H-norm the same posterior for every n; with a fixed variance per landmark it shrinks.
+
+    The flat prior is that on α > 0: an interval that leaves out α < 0.001 gives 0.1015.
+    """
     evidence = curve_evidence(n, ALPHAS, VARIANCE)
     np.testing.assert_allclose(evidence, log_kernel(n, ALPHAS, VARIANCE), rtol=1e-8)
     prior = scipy.stats.lognorm.logpdf(ALPHAS, 1.0)
@@ -429,7 +431,7 @@ def test_sine_bridge(num_steps):
 
 
 def test_law_of_an_endpoint():
-    """Periodic drift and noise over a long time: the law of X_T given the datum, and the evidence, of the Euler chain."""
+    """Periodic drift and noise over a long time: evidence, and the law of X_T given the datum, of the Euler chain."""
     t1, num_steps, x0, v, variance = 12.57, 1257, -np.pi / 2, 1.0, 0.1
     ts, grid = np.linspace(0, t1, num_steps + 1), np.arange(-30, 30, 0.075)
     dt, sd = ts[1], np.sqrt(ts[1]) * (2 + 0.5 * np.cos(grid))
