@@ -360,7 +360,7 @@ def test_undeclared_leading_axes():
         endpoint(seen, x0=STARTS)
     with pytest.raises(ValueError, match=r"`x0` must be one state.*\(4, 3, 2\)"):
         endpoint(seen, x0=STARTS, batch_shape=(5,))
-    with pytest.raises(ValueError, match="`diffusion`|the parts make neither one law"):
+    with pytest.raises(ValueError, match="`drift`|`diffusion`|the parts make neither one law"):
         endpoint(seen, jax.vmap(linear)(RATES, SHIFTS))
     flows = jax.vmap(lambda amplitude: nb.KunitaFlow(nb.Landmarks(5, 2), nb.GaussianKernel(amplitude, 0.6)))(SPREADS)
     with pytest.raises(ValueError, match="must be a scalar"):
