@@ -1,6 +1,7 @@
 """Referees in plain NumPy: processes, conditions, guides and guided paths, written again from their formulas.
 
-Every state is `(n, dim)` here and every linear map a dense matrix; nothing is structured and nothing is shared with the package.
+Every state is `(n, dim)` here and every linear map a dense matrix; nothing is structured, and nothing is shared with
+the package.
 """
 
 import contextlib

@@ -1,5 +1,4 @@
 from ._driving_noise import DrivingNoise as DrivingNoise
 from ._endpoint import DiffusionEndpoint as DiffusionEndpoint
 from ._noise_driven import AbstractNoiseDriven as AbstractNoiseDriven
-from ._sample import NoiseReparam as NoiseReparam
-from ._sample import sample as sample
+from ._sample import NoiseReparam as NoiseReparam, sample as sample

@@ -2,11 +2,7 @@
 
 from ._base import (
     AbstractKernel as AbstractKernel,
-)
-from ._base import (
     AbstractRadialKernel as AbstractRadialKernel,
-)
-from ._base import (
     KernelCombination as KernelCombination,
 )
 from ._gaussian import GaussianKernel as GaussianKernel

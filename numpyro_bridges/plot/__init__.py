@@ -5,7 +5,4 @@ The colours can be told apart by colour-blind readers (after Okabe & Ito); time 
 """
 
 from ._posterior import posterior as posterior
-from ._shapes import bridge_fan as bridge_fan
-from ._shapes import outlines as outlines
-from ._shapes import path as path
-from ._shapes import score_field as score_field
+from ._shapes import bridge_fan as bridge_fan, outlines as outlines, path as path, score_field as score_field
