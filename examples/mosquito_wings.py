@@ -29,9 +29,9 @@ import numpyro_bridges as nb
 parser = argparse.ArgumentParser()
 parser.add_argument("--quick", action="store_true", help="4 specimens, 16 points, few steps and draws")
 parser.add_argument("--genus", default="CX", help="a genus of the data set; CX is Culex")
-parser.add_argument("--specimens", type=int, default=6)
-parser.add_argument("--warmup", type=int, default=400)
-parser.add_argument("--samples", type=int, default=500)
+parser.add_argument("--specimens", type=int, default=4)
+parser.add_argument("--warmup", type=int, default=150)
+parser.add_argument("--samples", type=int, default=250)
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--output", type=Path, default=Path("output"))
 arguments, _ = parser.parse_known_args()
@@ -75,14 +75,20 @@ def model(observed=None, num_specimens=num_specimens):
 # NUTS on the two parameters and the driving noise of every path; the noise starts near zero, the guided mean path.
 
 # %%
-kernel = NUTS(model, init_strategy=init_to_median, dense_mass=[("amplitude", "length_scale")])
+kernel = NUTS(
+    model,
+    init_strategy=init_to_median,
+    dense_mass=[("amplitude", "length_scale")],
+    target_accept_prob=0.65,  # the best rate where most of thousands of dimensions are near normal
+    max_tree_depth=(6, 10),  # no long walks with the short first steps
+)
 mcmc = MCMC(kernel, num_warmup=num_warmup, num_samples=num_samples, num_chains=2)
 start = time.perf_counter()
 mcmc.run(jr.key(arguments.seed), points, extra_fields=nb.infer.HMC_FIELDS)
+posterior = jax.block_until_ready(mcmc.get_samples())
 print(f"{time.perf_counter() - start:.0f} s for 2 chains of {num_warmup} + {num_samples} draws")
 
 prior = Predictive(model, num_samples=2000, parallel=True)(jr.key(1), num_specimens=1)
-posterior = mcmc.get_samples()
 results = nb.to_arviz(mcmc, prior={name: prior[name] for name in ("amplitude", "length_scale")})
 
 # %%
