@@ -15,7 +15,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # ArviZ 0.x announces 1.x when it is imported
     import arviz
 
-pytestmark = pytest.mark.numpyro
+pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
 
 N, STEPS = 6, 2
 DATA = np.random.default_rng(0).normal(0.5, 0.6, (N, 2))

@@ -14,13 +14,7 @@ import numpyro_bridges as nb
 INF = np.inf
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _compile_quickly():
-    """Programs that run once: compiling them takes longer than running them."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
+pytestmark = pytest.mark.usefixtures("compile_quickly")
 
 def run(sde, box, x0, num_steps, count, t1=1.0, seed=0):
     """Log weights of independent noises; every path ends in the set."""

@@ -147,7 +147,15 @@ def test_constant_covariance(sde, condition, guide, key):
     check_bridge(*problem(sde, condition, guide), key, compiled=slow, inverse=not slow)
 
 
-@pytest.mark.parametrize("sde, guide", [(sde, g) for sde in CURVED for g in ("frozen", "receding")])
+def alternate(names, *choices):
+    """Every pair; the first of the choices for one name, the second for the next, and so on in the quick run."""
+    for i, name in enumerate(names):
+        for j, choice in enumerate(choices):
+            quick = i % len(choices) == j
+            yield pytest.param(name, choice, marks=() if quick else pytest.mark.slow)
+
+
+@pytest.mark.parametrize("sde, guide", alternate(CURVED, "frozen", "receding"))
 def test_curved_covariance(sde, guide, key):
     check_bridge(*problem(sde, "inexact-operator", guide), key, inverse=guide == "receding")
 
@@ -169,7 +177,7 @@ def test_conditions(condition, guide, key):
 @pytest.mark.parametrize(
     "sde, condition",
     [("user-planar", "exact"), ("kunita-landmark", "inexact-weights-picked"), ("kunita-spectral", "exact-mask"),
-     ("user-planar", "cylinder-gap")],
+     pytest.param("user-planar", "cylinder-gap", marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_planar_states(sde, condition, key):
     check_bridge(*problem(sde, condition, "receding"), key, compiled="cylinder" in condition, inverse=False)

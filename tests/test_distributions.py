@@ -14,6 +14,8 @@ from scipy import special, stats
 import numpyro_bridges as nb
 from numpyro_bridges.distributions import DrivingNoise
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+
 STEPS, DRAWS = 4, 16_000
 RATE, SIGMA, MEAN = 0.7, 0.5, 0.4
 X0 = np.array([[0.3, -0.2], [1.0, 0.1], [-0.6, 0.8]])
@@ -83,7 +85,7 @@ def weighted_draws(match):
     yield z, special.expit(law.given(z).log_prob(v) - density(match, v))
 
 
-@pytest.mark.parametrize("name", ["inexact", "exact, operator"])
+@pytest.mark.parametrize("name", ["inexact", pytest.param("exact, operator", marks=pytest.mark.slow)])
 def test_joint_draws_have_the_joint_density(name):
     (z, w), (z_free, w_free) = weighted_draws(MATCHES[name])
     for f in (lambda z: 1.0, lambda z: z[:, 1, 0, 0] ** 2, lambda z: z[:, -1, 1, 1] ** 2, lambda z: abs(z[:, 0, 2, 0])):

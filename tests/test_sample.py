@@ -15,7 +15,7 @@ from numpyro.infer.util import log_density
 
 import numpyro_bridges as nb
 
-pytestmark = pytest.mark.numpyro
+pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
 
 N, STEPS = 5, 3
 RATE, SIGMA, SPREAD = 0.8, 0.6, 0.05
@@ -318,6 +318,7 @@ def test_a_point_estimate_has_the_density_of_the_model():
     assert float(svi.evaluate(state, DATA)) == pytest.approx(-float(expected), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_kunita_flow_out_of_the_box():
     """In single precision, from NumPyro's own start: uniform on (−2, 2) for the noise is no trouble."""
     with jax.enable_x64(False):
