@@ -38,7 +38,7 @@ arguments, _ = parser.parse_known_args()
 quick = arguments.quick
 num_points, num_steps = (16, 10) if quick else (32, 50)
 num_specimens = 4 if quick else arguments.specimens
-num_warmup, num_samples = (60, 40) if quick else (arguments.warmup, arguments.samples)
+num_warmup, num_samples = (50, 30) if quick else (arguments.warmup, arguments.samples)
 numpyro.set_host_device_count(2)
 
 # %% [markdown]

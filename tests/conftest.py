@@ -17,6 +17,9 @@ jax.config.update("jax_enable_x64", True)
 # `pytestmark = pytest.mark.numpyro`.
 NUMPYRO = ("test_distributions", "test_infer", "test_examples", "test_readme")
 
+# Modules whose few tests take longest.
+LONG = ("test_examples", "test_docs", "test_kunita", "test_reference")
+
 
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, which take minutes")
@@ -24,6 +27,7 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
+    items.sort(key=lambda item: not item.path.name.startswith(LONG))  # first, so that both cores end together
     if not config.getoption("--slow"):
         skip = pytest.mark.skip(reason="slow: run with --slow")
         for item in items:

@@ -16,6 +16,7 @@ INF = np.inf
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
+
 def run(sde, box, x0, num_steps, count, t1=1.0, seed=0):
     """Log weights of independent noises; every path ends in the set."""
 

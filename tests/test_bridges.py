@@ -3,6 +3,8 @@
 log weight = log p(path) + log p(v | x_K) − log q(path).
 """
 
+import itertools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -143,32 +145,22 @@ def rotate(names, *choices):
     + [("BM-matrix", "inexact-operator", "drift")],
 )
 def test_constant_covariance(sde, condition, guide, key):
-    slow = sde in ("linear-matrix", "linear-hypoelliptic")  # to compile: matrix exponentials
-    check_bridge(*problem(sde, condition, guide), key, compiled=slow, inverse=not slow)
+    check_bridge(*problem(sde, condition, guide), key, compiled=True, inverse=sde != "linear-matrix")
 
 
 def alternate(names, *choices):
-    """Every pair; the first of the choices for one name, the second for the next, and so on in the quick run."""
-    for i, name in enumerate(names):
-        for j, choice in enumerate(choices):
-            quick = i % len(choices) == j
-            yield pytest.param(name, choice, marks=() if quick else pytest.mark.slow)
+    """Every pair; the quick run has the first of the choices for one name, the second for the next, and so on."""
+    pairs = itertools.product(enumerate(names), enumerate(choices))
+    marks = {True: (), False: pytest.mark.slow}
+    return [pytest.param(name, c, marks=marks[i % len(choices) == j]) for (i, name), (j, c) in pairs]
 
 
-@pytest.mark.parametrize("sde, guide", alternate(CURVED, "frozen", "receding"))
+@pytest.mark.parametrize("sde, guide", alternate(CURVED, *GUIDES))
 def test_curved_covariance(sde, guide, key):
-    check_bridge(*problem(sde, "inexact-operator", guide), key, inverse=guide == "receding")
+    check_bridge(*problem(sde, "inexact-operator", guide), key, inverse=guide in ("receding", "drift-receding"))
 
 
-OTHERS = ["auxiliary", "receding-mixed", "drift", "drift-receding"]
-
-
-@pytest.mark.parametrize("sde, guide", rotate(CURVED, OTHERS))
-def test_other_guides(sde, guide, key):
-    check_bridge(*problem(sde, "inexact-operator", guide), key, inverse=guide.startswith("drift"))
-
-
-@pytest.mark.parametrize("condition, guide", rotate(CONDITIONS, ["frozen", "receding", *OTHERS]))
+@pytest.mark.parametrize("condition, guide", rotate(CONDITIONS, list(GUIDES)))
 def test_conditions(condition, guide, key):
     compiled = "cylinder" in condition
     check_bridge(*problem("user-square", condition, guide), key, compiled=compiled, inverse=condition != "cylinder")

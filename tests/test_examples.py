@@ -23,7 +23,7 @@ def run(*command, cwd):
 def test_first_page(tmp_path):
     pytest.importorskip("ktch")
     page = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S).group(1)
-    shorter = page.replace("num_warmup=500, num_samples=500", "num_warmup=5, num_samples=5, progress_bar=False")
+    shorter = page.replace("num_warmup=500, num_samples=500", "num_warmup=1, num_samples=1, progress_bar=False")
     shorter = shorter.replace("num_particles=4096", "num_particles=256")
     assert shorter != page
     (tmp_path / "page.py").write_text(
@@ -47,6 +47,7 @@ def test_mosquito_wings(tmp_path):
         assert (tmp_path / "output" / name).stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_guided_weight_benchmark(tmp_path):
     out = run(str(ROOT / "benchmarks/guided_weight.py"), "--quick", cwd=tmp_path)
     assert float(re.search(r'"value_difference": ([^,]*)', out).group(1)) < 1e-4
