@@ -154,6 +154,7 @@ def test_probability_of_1e_12():
     np.testing.assert_allclose(d_high, norm.pdf(b) / first - hazard, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_probability_of_1e_12_of_correlated_coordinates():
     """P(X > 5.2, Y > 5.5) at correlation 0.6, and its derivative with respect to the start, by quadrature."""
     rho, a, b = 0.6, 5.8, 6.2
@@ -232,7 +233,12 @@ def nonlinear(lower, upper, z):
 
 @pytest.mark.parametrize(
     "lower, upper",
-    [([0.4, 0.1], [0.9, 0.6]), ([0.5, -INF], [INF, 0.1]), ([0.5, 0.2], [0.5, INF]), ([-INF, 0.8], [INF, 0.8])],
+    [
+        ([0.4, 0.1], [0.9, 0.6]),
+        ([0.5, -INF], [INF, 0.1]),
+        ([0.5, 0.2], [0.5, INF]),
+        pytest.param([-INF, 0.8], [INF, 0.8], marks=pytest.mark.slow),
+    ],
     ids=["interval", "half-lines", "point and half-line", "free and point"],
 )
 def test_nonlinear_process(lower, upper, last_but_one):

@@ -288,6 +288,7 @@ def test_predictive(mcmc):
     assert set(pointwise) == {"wing"} and pointwise["wing"].shape == (10, N)
 
 
+@pytest.mark.slow
 def test_an_unobserved_site_may_be_sampled_by_nuts():
     """N(z) exp(log_prob(v | z)) is a joint density of (z, v), whose margin of v is the law."""
     mcmc = MCMC(NUTS(lambda: nb.sample("wing", law(0.5))), num_warmup=200, num_samples=1000, progress_bar=False)

@@ -186,7 +186,9 @@ LIMITS = {
 }
 
 
-@pytest.mark.parametrize("case", LIMITS)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow if case == "geometric-Euler" else ()) for case in LIMITS]
+)
 def test_the_evidence_tends_to_the_density(case):
     """An exact match: within 2 dt + 3 SE of the closed form at dt = 1/40 and at dt = 1/80, the SE below dt/2.
 
