@@ -31,7 +31,7 @@ parser.add_argument("--quick", action="store_true", help="4 specimens, 16 points
 parser.add_argument("--genus", default="CX", help="a genus of the data set; CX is Culex")
 parser.add_argument("--specimens", type=int, default=4)
 parser.add_argument("--warmup", type=int, default=150)
-parser.add_argument("--samples", type=int, default=250)
+parser.add_argument("--samples", type=int, default=400)
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--output", type=Path, default=Path("output"))
 arguments, _ = parser.parse_known_args()
