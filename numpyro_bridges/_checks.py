@@ -33,6 +33,13 @@ def require(ok: Any, message: str) -> None:
         raise ValueError(message)
 
 
+def positive_integer(value: Any, name: str) -> int:
+    """A static size."""
+    good = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
+    require(good, f"`{name}` must be a positive integer; got {value!r}. It is known before tracing.")
+    return int(value)
+
+
 def require_instance(value: Any, kind: type, name: str, cure: str) -> None:
     """The value is of a class, whose name says what is meant."""
     require(isinstance(value, kind), f"`{name}` must be {cure}; got {value!r}.")

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import as_float, concrete, require, require_finite
+from .._checks import as_float, concrete, positive_integer, require, require_finite
 from .._types import RealScalar
 
 
@@ -36,10 +36,7 @@ def time_grid(
         return ts
     if t1 is None or num_steps is None:
         raise ValueError(f"Give `t1` and `num_steps`, or a grid `ts`; got t1 = {t1}, num_steps = {num_steps}.")
-    require(
-        isinstance(num_steps, (int, np.integer)) and not isinstance(num_steps, bool) and num_steps >= 1,
-        f"`num_steps` must be a positive integer; got {num_steps!r}.",
-    )
+    num_steps = positive_integer(num_steps, "num_steps")
     t0, t1 = as_float(t0, "t0"), as_float(t1, "t1")
     require(
         t0.ndim == 0 and t1.ndim == 0,
@@ -49,5 +46,5 @@ def time_grid(
         jnp.isfinite(t0) & jnp.isfinite(t1) & (t1 > t0),
         f"`t1` must be finite and later than `t0`; got t0 = {t0}, t1 = {t1}.",
     )
-    s = jnp.linspace(0.0, 1.0, int(num_steps) + 1)
+    s = jnp.linspace(0.0, 1.0, num_steps + 1)
     return t0 + (t1 - t0) * (s * (2 - s) if graded else s)

@@ -8,22 +8,15 @@ error (grid).
 import abc
 import itertools
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._checks import as_float, require, require_finite, require_positive
+from .._checks import as_float, positive_integer, require, require_finite, require_positive
 from .._linalg import add, cholesky
 from ..kernels import AbstractKernel
-
-
-def _positive_integer(value: Any, name: str) -> int:
-    good = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
-    require(good, f"`{name}` must be a positive integer; got {value!r}.")
-    return int(value)
 
 
 class AbstractNoise(eqx.Module):
@@ -95,7 +88,7 @@ class SpectralNoise(AbstractNoise):
     fixed_in_space = True
 
     def __init__(self, num_modes: int = 12, period=None, diameter=4.0):
-        self.num_modes = _positive_integer(num_modes, "num_modes")
+        self.num_modes = positive_integer(num_modes, "num_modes")
         self.period = None if period is None else as_float(period, "period")
         self.diameter = as_float(diameter, "diameter")
         require_positive(self.diameter, "diameter", "Give the largest distance of two points that is expected.")
@@ -160,7 +153,7 @@ class GridNoise(AbstractNoise):
         require_finite(self.lower, "lower")
         require_finite(self.upper, "upper")
         require(jnp.all(self.lower < self.upper), f"`lower` must be below `upper`; got {lower} and {upper}.")
-        self.num_cells = _positive_integer(num_cells, "num_cells")
+        self.num_cells = positive_integer(num_cells, "num_cells")
 
     def factor(self, kernel, covariance, points):
         if kernel is None:

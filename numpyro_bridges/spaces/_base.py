@@ -6,7 +6,6 @@ A closed curve s ↦ x(s) in R^dim, s in [0, 2π), is held as a state of n rows 
 """
 
 from abc import abstractmethod
-from operator import index
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -117,13 +116,3 @@ class AbstractSpace(eqx.Module):
 def equispaced(n: int) -> np.ndarray:
     """n parameters 2π i / n."""
     return 2 * np.pi * np.arange(n) / n
-
-
-def positive_integer(value: int, name: str) -> int:
-    """A static size."""
-    try:
-        size = index(value)
-    except TypeError:
-        size = 0
-    require(size > 0, f"`{name}` must be a positive integer, known before tracing; got {value!r}.")
-    return size

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import concrete, require
-from ._base import AbstractSpace, equispaced, floating, positive_integer
+from .._checks import concrete, positive_integer, require
+from ._base import AbstractSpace, equispaced, floating
 
 
 def fourier_functions(s: ArrayLike, num_modes: int) -> Any:

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import as_float, require, require_positive
-from ._base import AbstractSpace, equispaced, positive_integer
+from .._checks import as_float, positive_integer, require, require_positive
+from ._base import AbstractSpace, equispaced
 from ._fourier import fourier_functions
 
 
