@@ -1,0 +1,186 @@
+"""Hamiltonian Monte Carlo on function space [Beskos2011]_, jointly for noise and parameters.
+
+With x = (y, z), y the parameters whitened by their reference, and standard normal momentum p,
+
+    H = Ψ(x) + ½ |x|² + ½ |p|²,    Ψ = -log p(θ, z | v) - ½ |x|².
+
+The Gaussian part is a rotation of (x, p) by the step ε, which is exact; Ψ acts by kicks, p ← p - ½ε ∇Ψ, before and after
+it. ½ |x|² + ½ |p|² never enters the acceptance: the energy's error is the change of Ψ plus the work of the kicks, which
+has a limit as the grid is refined, and so the same step is good on every grid.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jax import Array
+from numpyro.infer.hmc_util import dual_averaging
+
+from .._checks import require
+from ._kernel import AbstractBridgeKernel
+from ._posterior import Sites, init_to_guided_mean
+from ._reference import Windows, start_windows, update_windows
+from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
+
+_MAX_ENERGY_ERROR = 1000.0  # a transition above it is called divergent, as in NumPyro
+
+
+class AdaptState(NamedTuple):
+    """`step_size`: ε. `averaging`: of its dual averaging. `windows`: of the parameters' reference."""
+
+    step_size: Array
+    averaging: tuple
+    windows: Windows
+
+
+class FunctionSpaceHMCState(NamedTuple):
+    """State of `FunctionSpaceHMC`, under the names of NumPyro's `HMCState`.
+
+    - `z`: unconstrained values. `misfit`, `gradient`: minus the log density of all but the noise's prior, and its gradient.
+    - `potential_energy`: minus the log joint density. `energy`: with the kinetic energy of the accepted end.
+    - `num_steps`: gradients of this draw. `diverging`: the energy was NaN, or off by more than 1000.
+    """
+
+    i: Array
+    z: Sites
+    misfit: Array
+    gradient: Sites
+    potential_energy: Array
+    energy: Array
+    num_steps: Array
+    accept_prob: Array
+    mean_accept_prob: Array
+    diverging: Array
+    adapt_state: AdaptState
+    rng_key: Array
+
+
+_start_averaging, _average = dual_averaging()
+
+
+class FunctionSpaceHMC(AbstractBridgeKernel):
+    """Hamiltonian Monte Carlo whose step does not shrink as the grid is refined.
+
+        MCMC(FunctionSpaceHMC(model), num_warmup=200, num_samples=500)
+
+    **Arguments:**
+
+    - `model`: a NumPyro model with sites of driving noise. Its other latent sites are continuous parameters, with a
+      dense mass matrix that is adapted in the warm-up, and started at a Laplace approximation.
+    - `step_size`: ε, an angle, adapted in the warm-up unless `adapt_step_size=False`.
+    - `target_accept_prob`: of that adaptation.
+    - `trajectory_length`: the angle by which the Gaussian part turns, π/2 forgets it, jittered by ± `jitter` of itself. A
+      draw takes `trajectory_length / step_size` gradients, rounded up.
+    - `max_num_steps`: bounds that number, and so keeps ε from below.
+    - `init_strategy`: the noise starts at zero, the guided mean path; parameters at their prior medians, from where the
+      Laplace approximation is sought. Chains start at draws from it, or at `init_params`.
+    """
+
+    def __init__(
+        self,
+        model,
+        *,
+        step_size: float = 1.0,
+        target_accept_prob: float = 0.8,
+        adapt_step_size: bool = True,
+        trajectory_length: float = 2.0,
+        jitter: float = 0.2,
+        max_num_steps: int = 32,
+        init_strategy=init_to_guided_mean,
+    ):
+        super().__init__(model, init_strategy)
+        require(step_size > 0, f"`step_size` must be positive; got {step_size}.")
+        require(0 < target_accept_prob < 1, f"`target_accept_prob` must be in (0, 1); got {target_accept_prob}.")
+        require(trajectory_length > 0, f"`trajectory_length` must be positive; got {trajectory_length}.")
+        require(0 <= jitter < 1, f"`jitter` must be in [0, 1); got {jitter}.")
+        self._step_size, self._adapt_step_size = step_size, adapt_step_size
+        self._target, self._length, self._jitter = target_accept_prob, trajectory_length, jitter
+        self._max_num_steps = max_num_steps
+
+    def get_diagnostics_str(self, state):
+        step, steps = float(state.adapt_state.step_size), int(state.num_steps)
+        return f"{steps} steps of size {step:.2e}. acc. prob={float(state.mean_accept_prob):.2f}"
+
+    def _init_one(self, key, z, reference, model_args, model_kwargs):
+        phi, gradient = jax.value_and_grad(self._misfit)(z, model_args, model_kwargs)
+        step = jnp.asarray(self._step_size, phi.dtype)
+        adapt = AdaptState(step, _start_averaging(jnp.log(step)), start_windows(reference))
+        energy = phi + half_square(self._parts(z)[1])
+        i, zero, no = jnp.array(0), jnp.zeros_like(phi), jnp.array(False)
+        return FunctionSpaceHMCState(i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key)
+
+    def refresh(self, state, model_args, model_kwargs):
+        phi, gradient = jax.value_and_grad(self._misfit)(state.z, model_args, model_kwargs)
+        return state._replace(
+            misfit=phi, gradient=gradient, potential_energy=phi + half_square(self._parts(state.z)[1])
+        )
+
+    def _sample_one(self, state, model_args, model_kwargs):
+        key, key_momentum, key_length, key_accept = jr.split(state.rng_key, 4)
+        reference = state.adapt_state.windows.reference
+        theta, noise, unravel = self._parts(state.z)
+        slope, force, _ = self._parts(state.gradient)
+        y = reference.whiten(theta)
+
+        def to_sites(x):
+            return unravel(reference.colour(x[0])) | x[1]
+
+        def psi(x):
+            return self._misfit(to_sites(x), model_args, model_kwargs) - half_square(x[0])
+
+        steps = jnp.ceil(self._length / state.adapt_state.step_size).astype(int)
+        turn = jr.uniform(key_length, (), y.dtype, 1 - self._jitter, 1 + self._jitter) * self._length
+        half = 0.5 * turn / steps
+
+        def leap(_, carry):
+            x, p, gradient, _, work = carry
+            p, before = kick(p, gradient, -half)
+            x, p = rotate(x, p, 2 * half)
+            value, gradient = jax.value_and_grad(psi)(x)
+            p, after = kick(p, gradient, -half)
+            return x, p, gradient, value, work + total(before) + total(after)
+
+        x = (y, noise)
+        old = state.misfit - half_square(y)
+        start = (x, normal_like(key_momentum, x), (reference.whiten_gradient(slope) - y, force), old, jnp.zeros_like(old))
+        x, p, (slope, force), new, work = jax.lax.fori_loop(0, steps, leap, start)
+        error = new - old + work
+        rate, accept = metropolis(key_accept, error)
+        moved = to_sites(x), new + half_square(x[0]), unravel(reference.colour_gradient(slope + x[0])) | force
+        z, phi, gradient = jax.tree.map(
+            lambda new, old: jnp.where(accept, new, old), moved, (state.z, state.misfit, state.gradient)
+        )
+        potential = phi + half_square(self._parts(z)[1])
+        return FunctionSpaceHMCState(
+            state.i + 1,
+            z,
+            phi,
+            gradient,
+            potential,
+            potential + half_square(p),
+            steps,
+            rate,
+            self._running_mean(state, rate),
+            ~(error < _MAX_ENERGY_ERROR),
+            self._adapted(state, rate, self._parts(z)[0]),
+            key,
+        )
+
+    def _adapted(self, state, rate, theta) -> AdaptState:
+        adapt = state.adapt_state
+        windows, renewed = update_windows(adapt.windows, state.i, self._num_warmup, theta)
+        step, averaging = adapt.step_size, adapt.averaging
+        if self._adapt_step_size:
+            averaging = _average(self._target - rate, averaging)
+            last = state.i == self._num_warmup - 1
+            mean = self._within_bounds(averaging[1])
+            step = jnp.where(renewed | last, mean, self._within_bounds(averaging[0]))
+            again = _start_averaging(jnp.log(mean))
+            averaging = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), again, averaging)
+        new = AdaptState(step, averaging, windows)
+        return jax.tree.map(lambda new, old: jnp.where(self._warming(state), new, old), new, adapt)
+
+    def _within_bounds(self, log_step):
+        """Two steps at least: with one, the parameters stick where the posterior is far from the reference."""
+        return jnp.clip(jnp.exp(log_step), self._length / self._max_num_steps, self._length / 2)

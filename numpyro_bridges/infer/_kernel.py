@@ -1,0 +1,147 @@
+"""What the kernels for bridges share. They are NumPyro kernels of a model whose noise carries the `driving_noise` mark."""
+
+import copy
+from abc import abstractmethod
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpyro
+from jax.flatten_util import ravel_pytree
+from numpyro.distributions import biject_to
+from numpyro.infer import init_to_sample
+from numpyro.infer.mcmc import MCMCKernel
+from numpyro.infer.util import constrain_fn
+from numpyro.util import is_prng_key
+
+from .._checks import require
+from ._posterior import Sites, init_to_guided_mean, is_noise, misfit
+from ._reference import Reference, laplace
+
+_SITES = "_gibbs_sites"  # the keyword by which `numpyro.infer.Gibbs` hands over the sites that a block does not own
+
+
+class AbstractBridgeKernel(MCMCKernel):
+    """A kernel of a model, written for one chain and mapped over several. Values in its state are unconstrained."""
+
+    sample_field = "z"
+
+    def __init__(self, model, init_strategy=init_to_guided_mean):
+        require(callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}.")
+        self._model = model
+        self._init_strategy = init_strategy
+        self._sample_fn = None
+
+    @abstractmethod
+    def _init_one(self, key, z: Sites, reference: Reference, model_args, model_kwargs):
+        """The state of one chain that starts at z."""
+
+    @abstractmethod
+    def _sample_one(self, state, model_args, model_kwargs):
+        """The next state of one chain."""
+
+    @property
+    def model(self):
+        return self._model
+
+    @property
+    def default_fields(self):
+        return ("z", "diverging")
+
+    def init(self, rng_key, num_warmup, init_params, model_args, model_kwargs):
+        model_kwargs = dict(model_kwargs or {})
+        self._num_warmup = num_warmup
+        self._check(model_args, model_kwargs)
+        if init_params is not None and _SITES in model_kwargs:  # `Gibbs` passes constrained values
+            init_params = self._unconstrained(init_params, model_args, model_kwargs)
+
+        def one(key, init_params):
+            key, key_start, key_reference = jr.split(key, 3)
+            z = self._start(key_start, model_args, model_kwargs) | (init_params or {})
+            z, reference = self._near_the_mode(key_reference, z, init_params is not None, model_args, model_kwargs)
+            return self._init_one(key, z, reference, model_args, model_kwargs)
+
+        single = is_prng_key(rng_key)
+        self._sample_fn = self._sample_one if single else jax.vmap(self._sample_one, (0, None, None))
+        state = jax.jit(one if single else jax.vmap(one))(rng_key, init_params)
+        potential = state.potential_energy
+        require(
+            isinstance(potential, jax.core.Tracer) or bool(jnp.all(jnp.isfinite(potential))),
+            f"the log density is {-potential} at the start: give other `init_params`, or check the model's data.",
+        )
+        return state
+
+    def sample(self, state, model_args, model_kwargs):
+        require(self._sample_fn is not None, "`init` must be called before `sample`.")
+        return self._sample_fn(state, model_args, dict(model_kwargs or {}))
+
+    def postprocess_fn(self, model_args, model_kwargs):
+        """Constrained values, and those of deterministic sites."""
+        return partial(constrain_fn, self._seeded, model_args, model_kwargs or {}, return_deterministic=True)
+
+    def get_constrain_fn(self, model_args, model_kwargs):
+        return partial(constrain_fn, self._seeded, model_args, model_kwargs or {})
+
+    def wrap_model(self, wrapper):
+        kernel = copy.copy(self)
+        kernel._model, kernel._sample_fn = wrapper(self._model), None
+        return kernel
+
+    def __getstate__(self):
+        return self.__dict__ | {"_sample_fn": None}
+
+    @property
+    def _seeded(self):
+        return numpyro.handlers.seed(self._model, 0)
+
+    def _latent(self, key, strategy, model_args, model_kwargs):
+        """The latent sites, with values by an initialisation strategy."""
+        model = numpyro.handlers.substitute(numpyro.handlers.seed(self._model, key), substitute_fn=strategy)
+        trace = numpyro.handlers.trace(model).get_trace(*model_args, **model_kwargs)
+        return {k: site for k, site in trace.items() if site["type"] == "sample" and not site["is_observed"]}
+
+    def _check(self, model_args, model_kwargs):
+        sites = self._latent(0, init_to_sample, model_args, model_kwargs)
+        name = type(self).__name__
+        discrete = [k for k, site in sites.items() if site["fn"].support.is_discrete]
+        require(not discrete, f"{name} cannot draw the discrete sites {discrete}: give them a block of `Gibbs`.")
+        self._noise = tuple(sorted(k for k, site in sites.items() if is_noise(site)))
+        require(
+            bool(self._noise),
+            f"{name} found no driving noise among the latent sites {sorted(sites)}: observe a law with "
+            "`numpyro_bridges.sample`, or mark the noise's site by `infer={'driving_noise': True}`.",
+        )
+
+    def _start(self, key, model_args, model_kwargs) -> Sites:
+        sites = self._latent(key, self._init_strategy, model_args, model_kwargs)
+        return {k: biject_to(site["fn"].support).inv(site["value"]) for k, site in sites.items()}
+
+    def _unconstrained(self, values, model_args, model_kwargs) -> Sites:
+        sites = self._latent(0, init_to_sample, model_args, model_kwargs)
+        return {k: biject_to(sites[k]["fn"].support).inv(jnp.asarray(v)) for k, v in values.items()}
+
+    def _near_the_mode(self, key, z, stay, model_args, model_kwargs):
+        """A Laplace approximation of the parameters' posterior, and a start drawn from it unless one was given."""
+        theta, noise, unravel = self._parts(z)
+        reference = laplace(lambda theta: self._misfit(unravel(theta) | noise, model_args, model_kwargs), theta)
+        start = theta if stay else reference.colour(jr.normal(key, theta.shape, theta.dtype))
+        return unravel(start) | noise, reference
+
+    def _misfit(self, z, model_args, model_kwargs):
+        """Φ(θ, z)."""
+        return misfit(self._model, model_args, model_kwargs, z)
+
+    def _parts(self, z: Sites):
+        """θ `(d,)`, the noise, and how θ becomes sites again."""
+        theta, unravel = ravel_pytree({k: v for k, v in z.items() if k not in self._noise})
+        return theta, {k: z[k] for k in self._noise}, unravel
+
+    def _warming(self, state):
+        return state.i < self._num_warmup
+
+    def _running_mean(self, state, rate):
+        """Mean acceptance since the start of the warm-up, then since its end."""
+        n = jnp.where(self._warming(state), state.i, state.i - self._num_warmup) + 1
+        mean = jnp.where(n == 1, 0.0, state.mean_accept_prob)
+        return mean + (rate - mean) / n

@@ -1,0 +1,216 @@
+"""Preconditioned Crank-Nicolson moves of the noise [Cotter2013]_, for `Gibbs` beside a kernel of the parameters.
+
+A move turns the noise z by an angle φ towards an independent p ~ N(0, I),
+
+    z' = cos(φ) z + sin(φ) p,
+
+which N(0, I) survives, and is accepted on the likelihood ratio alone: the rate does not depend on the grid. `PCNL`, the
+Langevin version, also kicks p by the gradient of the log likelihood, for half of φ before the turn and half of φ after.
+
+Data that are independent given the parameters, each with its own noise, move at once and are accepted one by one: one
+evaluation of the model updates them all, and each has its own angle.
+"""
+
+from abc import abstractmethod
+from math import pi
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jax import Array
+
+from .._checks import positive_integer, require
+from ._kernel import AbstractBridgeKernel
+from ._posterior import Sites, driven_by, energies_of, init_to_guided_mean
+from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
+
+
+class PCNState(NamedTuple):
+    """State of `PCN` and `PCNL`.
+
+    - `z`: the noise. `potential_energy`: minus the log joint density, up to what does not depend on the noise.
+    - `energies`: -log p(v_s | θ, z_s), an array for each noise site; one number where data share noise, or where it has
+      other uses. `force`: minus their gradient, in `PCNL`.
+    - `angles`: φ, shaped as `energies`, adapted in the warm-up. `accept_prob`: the mean over data and moves.
+    - `diverging`: an energy was NaN.
+    """
+
+    i: Array
+    z: Sites
+    potential_energy: Array
+    energies: tuple[Array, ...]
+    force: Sites
+    angles: tuple[Array, ...]
+    accept_prob: Array
+    mean_accept_prob: Array
+    diverging: Array
+    rng_key: Array
+
+
+class AbstractPCN(AbstractBridgeKernel):
+    def __init__(
+        self,
+        model,
+        *,
+        num_moves: int = 1,
+        num_blocks: int = 1,
+        angle: float = 1.0,
+        adapt_angle: bool = True,
+        target_accept_prob: float = 0.4,
+        init_strategy=init_to_guided_mean,
+    ):
+        super().__init__(model, init_strategy)
+        require(0 < angle <= pi / 2, f"`angle` must be in (0, π/2]; got {angle}.")
+        require(0 < target_accept_prob < 1, f"`target_accept_prob` must be in (0, 1); got {target_accept_prob}.")
+        self._num_moves = positive_integer(num_moves, "num_moves")
+        self._num_blocks = positive_integer(num_blocks, "num_blocks")
+        self._angle, self._adapt_angle, self._target = angle, adapt_angle, target_accept_prob
+
+    @abstractmethod
+    def _evaluate(self, z: Sites, model_args, model_kwargs) -> tuple[tuple[Array, ...], Sites]:
+        """Energies, and the force on the noise; an empty one, if the energies alone decide."""
+
+    def get_diagnostics_str(self, state):
+        angles = jnp.concatenate([jnp.ravel(angle) for angle in state.angles])
+        return f"mean angle {float(jnp.mean(angles)):.2f}. acc. prob={float(state.mean_accept_prob):.2f}"
+
+    def _init_one(self, key, z, reference, model_args, model_kwargs):
+        parameters = sorted(set(z) - set(self._noise))
+        require(
+            not parameters,
+            f"{type(self).__name__} moves noise alone, and the model has parameters, {parameters}: give them a block, "
+            f"`Gibbs([({type(self).__name__}(model), noise_sites), (NUTS(model), None)])`.",
+        )
+        self._owners = driven_by(self._model, model_args, model_kwargs, z)
+        energies, force = self._evaluate(z, model_args, model_kwargs)
+        angles = tuple(jnp.full_like(energy, self._angle) for energy in energies)
+        i, zero, no = jnp.array(0), jnp.zeros_like(total(energies)), jnp.array(False)
+        return PCNState(i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key)
+
+    def refresh(self, state, model_args, model_kwargs):
+        energies, force = self._evaluate(state.z, model_args, model_kwargs)
+        return state._replace(potential_energy=_potential(state.z, energies), energies=energies, force=force)
+
+    def _sample_one(self, state, model_args, model_kwargs):
+        key, key_moves = jr.split(state.rng_key)
+
+        def move(m, carry):
+            state, rates = carry
+            state, rate = self._move(jr.fold_in(key_moves, m), m, state, model_args, model_kwargs)
+            return state, rates + rate / self._num_moves
+
+        start = (state._replace(diverging=jnp.array(False)), jnp.zeros_like(state.accept_prob))
+        new, rate = jax.lax.fori_loop(0, self._num_moves, move, start)
+        return new._replace(
+            i=state.i + 1,
+            potential_energy=_potential(new.z, new.energies),
+            accept_prob=rate,
+            mean_accept_prob=self._running_mean(state, rate),
+            rng_key=key,
+        )
+
+    def _move(self, key, m, state, model_args, model_kwargs):
+        """Turns the noise of one block of time steps, and decides for each datum."""
+        key_p, key_accept = jr.split(key)
+        old, names = state.z, sorted(state.z)
+        groups = [tuple(names)] if self._owners is None else [(name,) for name in names]
+        block = (state.i * self._num_moves + m) % self._num_blocks
+        turns = {
+            name: _widened(angle, old[name]) * _inside(block, self._num_blocks, old[name])
+            for group, angle in zip(groups, state.angles, strict=True)
+            for name in group
+        }
+        p, before = _kicked(normal_like(key_p, old), state.force, turns)
+        new, p = rotate(old, p, turns)
+        energies, force = self._evaluate(new, model_args, model_kwargs)
+        _, after = _kicked(p, force, turns)
+
+        accept, rates = {}, []
+        for key, group, e_new, e_old in zip(
+            jr.split(key_accept, len(groups)), groups, energies, state.energies, strict=True
+        ):
+            work = sum(_sum_to(before[name] + after[name], e_new) for name in group if name in force)
+            rate, decisions = metropolis(key, e_new - e_old + work)
+            accept |= {name: decisions for name in group}
+            rates.append(rate)
+
+        def chosen(new, old):
+            return {name: jnp.where(_widened(accept[name], new[name]), new[name], old[name]) for name in new}
+
+        decisions = [accept[group[0]] for group in groups]
+        state = state._replace(
+            z=chosen(new, old),
+            energies=jax.tree.map(jnp.where, tuple(decisions), energies, state.energies),
+            force=chosen(force, state.force),
+            angles=tuple(self._adapted(state, a, r) for a, r in zip(state.angles, rates, strict=True)),
+            diverging=state.diverging | jnp.isnan(total(energies)),
+        )
+        return state, total(rates) / sum(rate.size for rate in rates)
+
+    def _adapted(self, state, angle, rate):
+        """Robbins-Monro: the rate tends to its target, or stays above it at the largest angle, π/2."""
+        if not self._adapt_angle:
+            return angle
+        gain = (state.i + 1.0) ** -0.6
+        new = jnp.clip(angle * jnp.exp(gain * (rate - self._target)), 1e-3, pi / 2)
+        return jnp.where(self._warming(state), new, angle)
+
+
+class PCN(AbstractPCN):
+    """Preconditioned Crank-Nicolson moves of the noise: no gradients.
+
+        Gibbs([(PCN(model, num_moves=3), noise_sites), (NUTS(model), None)])
+
+    **Arguments:**
+
+    - `model`: a NumPyro model with sites of driving noise, and no other latent sites but those of other blocks.
+    - `num_moves`: moves for each draw.
+    - `num_blocks`: the time steps are cut into that many blocks, of which every move turns the next. It helps where
+      whole paths are hardly accepted.
+    - `angle`: φ in (0, π/2], π/2 being an independent proposal. Adapted in the warm-up, for each datum on its own, to
+      `target_accept_prob`, unless `adapt_angle=False`.
+    """
+
+    def _evaluate(self, z, model_args, model_kwargs):
+        return energies_of(self._model, model_args, model_kwargs, z, self._owners), {}
+
+
+class PCNL(AbstractPCN):
+    """Preconditioned Crank-Nicolson Langevin moves of the noise: `PCN` with gradients, which pay where φ is small."""
+
+    def __init__(self, model, *, target_accept_prob: float = 0.7, **settings):
+        super().__init__(model, target_accept_prob=target_accept_prob, **settings)
+
+    def _evaluate(self, z, model_args, model_kwargs):
+        def energy(z):
+            energies = energies_of(self._model, model_args, model_kwargs, z, self._owners)
+            return total(energies), energies
+
+        gradient, energies = jax.grad(energy, has_aux=True)(z)
+        return energies, jax.tree.map(jnp.negative, gradient)
+
+
+def _potential(z, energies):
+    return total(energies) + half_square(z)
+
+
+def _kicked(p, force, turns):
+    """Forces act for half of the turn, where there are any."""
+    new, change = kick({n: p[n] for n in force}, force, {n: 0.5 * turns[n] for n in force})
+    return p | new, change
+
+
+def _inside(block, num_blocks, noise):
+    """1 in a block of the time steps, an axis of the noise `(..., num_steps, k, dim)`; 0 outside."""
+    steps = noise.shape[-3]
+    return (jnp.arange(steps) * num_blocks // steps == block).astype(noise.dtype)[:, None, None]
+
+
+def _widened(a, like):
+    return a.reshape(a.shape + (1,) * (like.ndim - a.ndim))
+
+
+def _sum_to(a, like):
+    """The sum over the axes that `like` lacks, which are the last."""
+    return jnp.sum(a, axis=tuple(range(like.ndim, a.ndim)))

@@ -1,0 +1,104 @@
+"""The posterior of a model, split as the kernels need it.
+
+With θ the unconstrained parameters, z the driving noise and v_s the data that it drives,
+
+    -log p(θ, z | v) = Φ(θ, z) + ½ |z|² + const,    Φ = rest(θ) - Σ_s log p(v_s | θ, z_s),
+
+`rest` holding priors of parameters, Jacobians, factors and data that no noise drives.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
+from jax import Array
+from numpyro.distributions import constraints
+from numpyro.infer import init_to_median
+from numpyro.infer.util import potential_energy
+from numpyro.primitives import Messenger
+
+from ..distributions import AbstractNoiseDriven
+
+Sites = dict[str, Array]
+
+
+def init_to_guided_mean(site=None, num_samples: int = 15):
+    """Initial values: noise at zero, which gives the noise-free guided path; parameters at their prior medians."""
+    if site is not None and is_noise(site):
+        return jnp.zeros(site["fn"].shape())
+    return init_to_median(site, num_samples)
+
+
+def is_noise(site) -> bool:
+    return site["type"] == "sample" and bool(site["infer"].get("driving_noise"))
+
+
+def noise_sites(trace) -> tuple[str, ...]:
+    """Names of the driving noise in a trace: the block of `PCN` in `Gibbs([(PCN(model), noise_sites), ...])`."""
+    return tuple(name for name, site in trace.items() if is_noise(site) and not site["is_observed"])
+
+
+class _Split(Messenger):
+    """Takes the prior of the noise, and the likelihoods that it drives, out of a model; keeps the latter."""
+
+    def __init__(self, fn):
+        super().__init__(fn)
+        self.log_likelihood = {}
+
+    def process_message(self, msg):
+        if msg["type"] != "sample":
+            return
+        fn = msg["fn"]
+        if is_noise(msg):
+            msg["fn"] = dist.ImproperUniform(constraints.real, fn.batch_shape, fn.event_shape)
+        elif msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
+            log_prob = fn.log_prob(msg["value"])
+            self.log_likelihood[msg["name"]] = log_prob if msg["scale"] is None else msg["scale"] * log_prob
+            msg["fn"] = fn.mask(False)
+
+
+def split(model, model_args, model_kwargs, z: Sites) -> tuple[Array, Sites]:
+    """rest(θ), and log p(v_s | θ, z_s) of every site that noise drives, shaped as its batch."""
+    parts = _Split(numpyro.handlers.seed(model, 0))
+    rest = potential_energy(parts, model_args, model_kwargs, z)
+    return rest, parts.log_likelihood
+
+
+def misfit(model, model_args, model_kwargs, z: Sites) -> Array:
+    """Φ(θ, z)."""
+    rest, log_likelihood = split(model, model_args, model_kwargs, z)
+    return rest - sum(map(jnp.sum, log_likelihood.values()))
+
+
+def energies_of(model, model_args, model_kwargs, z: Sites, owners) -> tuple[Array, ...]:
+    """Energies -log p(v_s | θ, z_s), an array for each noise; the one energy Φ where `owners` is `None`."""
+    if owners is None:
+        return (misfit(model, model_args, model_kwargs, z),)
+    _, log_likelihood = split(model, model_args, model_kwargs, z)
+    return tuple(-log_likelihood[owners[noise]] for noise in sorted(owners))
+
+
+def driven_by(model, model_args, model_kwargs, z: Sites, noise=None) -> dict[str, str] | None:
+    """The site that each noise drives, if it drives one of the same batch and nothing else; `None` otherwise.
+
+    Where this holds, the data are independent given θ, each with its own noise. `noise`: names, of all of z by default.
+    """
+    noise = set(z if noise is None else noise)
+    closed, shapes = jax.make_jaxpr(lambda z: split(model, model_args, model_kwargs, z), return_shape=True)(z)
+    names = sorted(z)  # the order of the inputs
+    rest, *terms = [{names[i] for i in _inputs_of(closed.jaxpr, out)} & noise for out in closed.jaxpr.outvars]
+    driven = {}
+    for (site, shape), sources in zip(sorted(shapes[1].items()), terms, strict=True):
+        if len(sources) != 1 or not sources.isdisjoint(driven) or shape.shape != z[min(sources)].shape[: shape.ndim]:
+            return None
+        driven[min(sources)] = site
+    return driven if set(driven) == noise and not rest else None
+
+
+def _inputs_of(jaxpr, out) -> set[int]:
+    """Indices of the inputs on which an output depends, each equation taken as a whole."""
+    needed = {out}
+    for equation in reversed(jaxpr.eqns):
+        if any(variable in needed for variable in equation.outvars):
+            needed.update(variable for variable in equation.invars if not hasattr(variable, "val"))
+    return {i for i, variable in enumerate(jaxpr.invars) if variable in needed}

@@ -1,0 +1,88 @@
+"""A Gaussian reference N(μ, L Lᵀ) of the posterior of the unconstrained parameters, θ = μ + L y.
+
+It starts as a Laplace approximation with the noise at zero, and is renewed from the draws at the end of each window of
+the warm-up (Stan's schedule). y has the role of the noise: N(0, I) but for what the kernels correct.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.scipy.linalg import solve_triangular
+from jax.scipy.optimize import minimize
+from numpyro.infer.hmc_util import build_adaptation_schedule, welford_covariance
+
+
+class Reference(NamedTuple):
+    """μ `(d,)` and L `(d, d)`, lower triangular."""
+
+    mean: Array
+    scale: Array
+
+    def whiten(self, theta):
+        """y = L⁻¹ (θ - μ)."""
+        return solve_triangular(self.scale, theta - self.mean, lower=True) if theta.size else theta
+
+    def colour(self, y):
+        """θ = μ + L y."""
+        return self.mean + self.scale @ y
+
+    def whiten_gradient(self, gradient):
+        """∇_y = Lᵀ ∇_θ."""
+        return self.scale.T @ gradient
+
+    def colour_gradient(self, gradient):
+        """∇_θ = L⁻ᵀ ∇_y."""
+        return solve_triangular(self.scale.T, gradient, lower=False) if gradient.size else gradient
+
+
+def laplace(potential, theta: Array) -> Reference:
+    """The mode of exp(-potential) and its inverse Hessian, both by BFGS from θ; N(θ, I) where that fails."""
+    start = Reference(theta, jnp.eye(theta.size, dtype=theta.dtype))
+    if not theta.size:
+        return start
+    found = minimize(potential, theta, method="BFGS", options={"maxiter": 50})
+    return _if_finite(Reference(found.x, jnp.linalg.cholesky(found.hess_inv)), start)
+
+
+class Windows(NamedTuple):
+    """The reference in use, and mean, sum of squares and number of the draws of the current window."""
+
+    reference: Reference
+    moments: tuple[Array, Array, Array]
+
+
+_no_moments, _add, _ = welford_covariance(diagonal=False)
+
+
+def start_windows(reference: Reference) -> Windows:
+    return Windows(reference, _no_moments(reference.mean.size))
+
+
+def update_windows(windows: Windows, i: Array, num_warmup: int, theta: Array) -> tuple[Windows, Array]:
+    """Adds draw i of the warm-up; at the end of a window renews the reference. Says whether it did."""
+    schedule = build_adaptation_schedule(num_warmup)[1:-1]
+    if not schedule or not theta.size:
+        return windows, jnp.array(False)
+    inside = (i >= schedule[0].start) & (i <= schedule[-1].end)
+    ends = jnp.any(i == jnp.array([window.end for window in schedule]))
+    moments = _where(inside, _add(theta, windows.moments), windows.moments)
+    renewed = start_windows(_if_finite(_from_moments(*moments), windows.reference))
+    return _where(ends, renewed, windows._replace(moments=moments)), ends
+
+
+def _from_moments(mean, m2, n) -> Reference:
+    """Correlations are shrunk as if 5 more draws had none: the factor exists for any number of draws."""
+    covariance = m2 / (n - 1)
+    covariance = (n * covariance + 5 * jnp.diag(jnp.diag(covariance))) / (n + 5)
+    return Reference(mean, jnp.linalg.cholesky(covariance))
+
+
+def _if_finite(new: Reference, old: Reference) -> Reference:
+    good = jnp.all(jnp.isfinite(new.scale)) & jnp.all(jnp.diag(new.scale) > 0) & jnp.all(jnp.isfinite(new.mean))
+    return _where(good, new, old)
+
+
+def _where(condition, new, old):
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)

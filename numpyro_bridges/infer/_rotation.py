@@ -1,0 +1,40 @@
+"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks by a force, and the decision to accept."""
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+
+
+def rotate(x, p, angle):
+    """x and p after a time: one for all, or a pytree of times."""
+    angle = angle if jax.tree.structure(angle) == jax.tree.structure(x) else jax.tree.map(lambda _: angle, x)
+    new = jax.tree.map(lambda x, p, a: jnp.cos(a) * x + jnp.sin(a) * p, x, p, angle)
+    return new, jax.tree.map(lambda x, p, a: jnp.cos(a) * p - jnp.sin(a) * x, x, p, angle)
+
+
+def kick(p, force, time):
+    """p after the force has acted for a time, and the change of ½ p² of each coordinate."""
+    time = time if jax.tree.structure(time) == jax.tree.structure(p) else jax.tree.map(lambda _: time, p)
+    change = jax.tree.map(lambda p, f, t: (p + 0.5 * t * f) * t * f, p, force, time)
+    return jax.tree.map(lambda p, f, t: p + t * f, p, force, time), change
+
+
+def metropolis(key, error):
+    """Acceptance probabilities exp(-error), 0 where it is NaN, and decisions drawn with them."""
+    rate = jnp.exp(-jnp.maximum(jnp.where(jnp.isnan(error), jnp.inf, error), 0.0))
+    return rate, jr.uniform(key, rate.shape, rate.dtype) < rate
+
+
+def half_square(x):
+    """½ |x|²."""
+    return 0.5 * total(jax.tree.map(jnp.square, x))
+
+
+def total(x):
+    return sum(map(jnp.sum, jax.tree.leaves(x)))
+
+
+def normal_like(key, x):
+    leaves, treedef = jax.tree.flatten(x)
+    keys = jr.split(key, len(leaves))
+    return jax.tree.unflatten(treedef, [jr.normal(k, a.shape, a.dtype) for k, a in zip(keys, leaves, strict=True)])
