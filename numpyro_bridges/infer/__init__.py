@@ -4,3 +4,8 @@ from ._arviz import HMC_FIELDS as HMC_FIELDS, to_arviz as to_arviz
 from ._hmc import FunctionSpaceHMC as FunctionSpaceHMC, FunctionSpaceHMCState as FunctionSpaceHMCState
 from ._pcn import PCN as PCN, PCNL as PCNL, PCNState as PCNState
 from ._posterior import init_to_guided_mean as init_to_guided_mean, noise_sites as noise_sites
+from ._pseudo_marginal import (
+    CorrelatedPseudoMarginal as CorrelatedPseudoMarginal,
+    CorrelatedPseudoMarginalMALA as CorrelatedPseudoMarginalMALA,
+    PseudoMarginalState as PseudoMarginalState,
+)

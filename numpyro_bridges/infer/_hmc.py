@@ -4,9 +4,9 @@ With x = (y, z), y the parameters whitened by their reference, and standard norm
 
     H = Ψ(x) + ½ |x|² + ½ |p|²,    Ψ = -log p(θ, z | v) - ½ |x|².
 
-The Gaussian part is a rotation of (x, p) by the step ε, which is exact; Ψ acts by kicks, p ← p - ½ε ∇Ψ, before and after
-it. ½ |x|² + ½ |p|² never enters the acceptance: the energy's error is the change of Ψ plus the work of the kicks, which
-has a limit as the grid is refined, and so the same step is good on every grid.
+The Gaussian part is a rotation of (x, p) by the step ε, which is exact; Ψ acts by kicks, p ← p - ½ε ∇Ψ, before and
+after it. ½ |x|² + ½ |p|² never enters the acceptance: the energy's error is the change of Ψ plus the work of the kicks,
+which has a limit as the grid is refined, and so the same step is good on every grid.
 """
 
 from typing import NamedTuple
@@ -15,13 +15,13 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 from jax import Array
-from numpyro.infer.hmc_util import dual_averaging
 
 from .._checks import require
 from ._kernel import AbstractBridgeKernel
 from ._posterior import Sites, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
 from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
+from ._step_size import StepSize, start_step_size, update_step_size
 
 _MAX_ENERGY_ERROR = 1000.0  # a transition above it is called divergent, as in NumPyro
 
@@ -37,7 +37,7 @@ class AdaptState(NamedTuple):
 class FunctionSpaceHMCState(NamedTuple):
     """State of `FunctionSpaceHMC`, under the names of NumPyro's `HMCState`.
 
-    - `z`: unconstrained values. `misfit`, `gradient`: minus the log density of all but the noise's prior, and its gradient.
+    - `z`: unconstrained values. `misfit`, `gradient`: Φ, minus the log density without the noise's prior.
     - `potential_energy`: minus the log joint density. `energy`: with the kinetic energy of the accepted end.
     - `num_steps`: gradients of this draw. `diverging`: the energy was NaN, or off by more than 1000.
     """
@@ -56,9 +56,6 @@ class FunctionSpaceHMCState(NamedTuple):
     rng_key: Array
 
 
-_start_averaging, _average = dual_averaging()
-
-
 class FunctionSpaceHMC(AbstractBridgeKernel):
     """Hamiltonian Monte Carlo whose step does not shrink as the grid is refined.
 
@@ -70,8 +67,8 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
       dense mass matrix that is adapted in the warm-up, and started at a Laplace approximation.
     - `step_size`: ε, an angle, adapted in the warm-up unless `adapt_step_size=False`.
     - `target_accept_prob`: of that adaptation.
-    - `trajectory_length`: the angle by which the Gaussian part turns, π/2 forgets it, jittered by ± `jitter` of itself. A
-      draw takes `trajectory_length / step_size` gradients, rounded up.
+    - `trajectory_length`: the angle by which the Gaussian part turns (π/2 forgets it), jittered by ± `jitter` of
+      itself. A draw takes `trajectory_length / step_size` gradients, rounded up.
     - `max_num_steps`: bounds that number, and so keeps ε from below.
     - `init_strategy`: the noise starts at zero, the guided mean path; parameters at their prior medians, from where the
       Laplace approximation is sought. Chains start at draws from it, or at `init_params`.
@@ -105,7 +102,7 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
     def _init_one(self, key, z, reference, model_args, model_kwargs):
         phi, gradient = jax.value_and_grad(self._misfit)(z, model_args, model_kwargs)
         step = jnp.asarray(self._step_size, phi.dtype)
-        adapt = AdaptState(step, _start_averaging(jnp.log(step)), start_windows(reference))
+        adapt = AdaptState(*start_step_size(step), start_windows(reference))
         energy = phi + half_square(self._parts(z)[1])
         i, zero, no = jnp.array(0), jnp.zeros_like(phi), jnp.array(False)
         return FunctionSpaceHMCState(i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key)
@@ -143,7 +140,8 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
 
         x = (y, noise)
         old = state.misfit - half_square(y)
-        start = (x, normal_like(key_momentum, x), (reference.whiten_gradient(slope) - y, force), old, jnp.zeros_like(old))
+        gradient = reference.whiten_gradient(slope) - y, force
+        start = x, normal_like(key_momentum, x), gradient, old, jnp.zeros_like(old)
         x, p, (slope, force), new, work = jax.lax.fori_loop(0, steps, leap, start)
         error = new - old + work
         rate, accept = metropolis(key_accept, error)
@@ -170,17 +168,11 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
     def _adapted(self, state, rate, theta) -> AdaptState:
         adapt = state.adapt_state
         windows, renewed = update_windows(adapt.windows, state.i, self._num_warmup, theta)
-        step, averaging = adapt.step_size, adapt.averaging
+        step = StepSize(adapt.step_size, adapt.averaging)
         if self._adapt_step_size:
-            averaging = _average(self._target - rate, averaging)
+            # Two steps at least: with one, parameters stick where their posterior is far from the reference.
+            bounds = self._length / self._max_num_steps, self._length / 2
             last = state.i == self._num_warmup - 1
-            mean = self._within_bounds(averaging[1])
-            step = jnp.where(renewed | last, mean, self._within_bounds(averaging[0]))
-            again = _start_averaging(jnp.log(mean))
-            averaging = jax.tree.map(lambda new, old: jnp.where(renewed, new, old), again, averaging)
-        new = AdaptState(step, averaging, windows)
+            step = update_step_size(step, self._target - rate, bounds, renew=renewed, last=last)
+        new = AdaptState(*step, windows)
         return jax.tree.map(lambda new, old: jnp.where(self._warming(state), new, old), new, adapt)
-
-    def _within_bounds(self, log_step):
-        """Two steps at least: with one, the parameters stick where the posterior is far from the reference."""
-        return jnp.clip(jnp.exp(log_step), self._length / self._max_num_steps, self._length / 2)

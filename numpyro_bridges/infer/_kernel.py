@@ -1,4 +1,4 @@
-"""What the kernels for bridges share. They are NumPyro kernels of a model whose noise carries the `driving_noise` mark."""
+"""What the kernels share: they are NumPyro kernels of a model whose noise carries the `driving_noise` mark."""
 
 import copy
 from abc import abstractmethod
@@ -7,31 +7,31 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 import numpyro
 from jax.flatten_util import ravel_pytree
 from numpyro.distributions import biject_to
 from numpyro.infer import init_to_sample
+from numpyro.infer.gibbs import GIBBS_SITES_KWARG
 from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import constrain_fn
 from numpyro.util import is_prng_key
 
-from .._checks import require
+from .._checks import concrete, require
 from ._posterior import Sites, init_to_guided_mean, is_noise, misfit
 from ._reference import Reference, laplace
-
-_SITES = "_gibbs_sites"  # the keyword by which `numpyro.infer.Gibbs` hands over the sites that a block does not own
 
 
 class AbstractBridgeKernel(MCMCKernel):
     """A kernel of a model, written for one chain and mapped over several. Values in its state are unconstrained."""
-
-    sample_field = "z"
 
     def __init__(self, model, init_strategy=init_to_guided_mean):
         require(callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}.")
         self._model = model
         self._init_strategy = init_strategy
         self._sample_fn = None
+        self._noise: tuple[str, ...] = ()
+        self._owners: dict[str, str] | None = None
 
     @abstractmethod
     def _init_one(self, key, z: Sites, reference: Reference, model_args, model_kwargs):
@@ -46,6 +46,10 @@ class AbstractBridgeKernel(MCMCKernel):
         return self._model
 
     @property
+    def sample_field(self):
+        return "z"
+
+    @property
     def default_fields(self):
         return ("z", "diverging")
 
@@ -53,7 +57,7 @@ class AbstractBridgeKernel(MCMCKernel):
         model_kwargs = dict(model_kwargs or {})
         self._num_warmup = num_warmup
         self._check(model_args, model_kwargs)
-        if init_params is not None and _SITES in model_kwargs:  # `Gibbs` passes constrained values
+        if init_params is not None and GIBBS_SITES_KWARG in model_kwargs:  # `Gibbs` passes constrained values
             init_params = self._unconstrained(init_params, model_args, model_kwargs)
 
         def one(key, init_params):
@@ -65,16 +69,18 @@ class AbstractBridgeKernel(MCMCKernel):
         single = is_prng_key(rng_key)
         self._sample_fn = self._sample_one if single else jax.vmap(self._sample_one, (0, None, None))
         state = jax.jit(one if single else jax.vmap(one))(rng_key, init_params)
-        potential = state.potential_energy
+        potential = concrete(state.potential_energy)
         require(
-            isinstance(potential, jax.core.Tracer) or bool(jnp.all(jnp.isfinite(potential))),
-            f"the log density is {-potential} at the start: give other `init_params`, or check the model's data.",
+            potential is None or bool(np.all(np.isfinite(potential))),
+            f"the potential energy is {potential} at the start: give other `init_params`, or check the model's data.",
         )
         return state
 
     def sample(self, state, model_args, model_kwargs):
-        require(self._sample_fn is not None, "`init` must be called before `sample`.")
-        return self._sample_fn(state, model_args, dict(model_kwargs or {}))
+        step = self._sample_fn
+        if step is None:
+            raise ValueError("`init` must be called before `sample`.")
+        return step(state, model_args, dict(model_kwargs or {}))
 
     def postprocess_fn(self, model_args, model_kwargs):
         """Constrained values, and those of deterministic sites."""

@@ -22,7 +22,7 @@ from jax import Array
 
 from .._checks import positive_integer, require
 from ._kernel import AbstractBridgeKernel
-from ._posterior import Sites, driven_by, energies_of, init_to_guided_mean
+from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
 
 
@@ -113,8 +113,7 @@ class AbstractPCN(AbstractBridgeKernel):
     def _move(self, key, m, state, model_args, model_kwargs):
         """Turns the noise of one block of time steps, and decides for each datum."""
         key_p, key_accept = jr.split(key)
-        old, names = state.z, sorted(state.z)
-        groups = [tuple(names)] if self._owners is None else [(name,) for name in names]
+        old, groups = state.z, groups_of(state.z, self._owners)
         block = (state.i * self._num_moves + m) % self._num_blocks
         turns = {
             name: _widened(angle, old[name]) * _inside(block, self._num_blocks, old[name])
@@ -173,7 +172,8 @@ class PCN(AbstractPCN):
     """
 
     def _evaluate(self, z, model_args, model_kwargs):
-        return energies_of(self._model, model_args, model_kwargs, z, self._owners), {}
+        _, energies = energies_of(self._model, model_args, model_kwargs, z, self._owners)
+        return energies, {}
 
 
 class PCNL(AbstractPCN):
@@ -184,7 +184,7 @@ class PCNL(AbstractPCN):
 
     def _evaluate(self, z, model_args, model_kwargs):
         def energy(z):
-            energies = energies_of(self._model, model_args, model_kwargs, z, self._owners)
+            _, energies = energies_of(self._model, model_args, model_kwargs, z, self._owners)
             return total(energies), energies
 
         gradient, energies = jax.grad(energy, has_aux=True)(z)

@@ -54,13 +54,13 @@ class _Split(Messenger):
         elif msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
             log_prob = fn.log_prob(msg["value"])
             self.log_likelihood[msg["name"]] = log_prob if msg["scale"] is None else msg["scale"] * log_prob
-            msg["fn"] = fn.mask(False)
+            msg["fn"] = fn.mask(jnp.array(False))
 
 
 def split(model, model_args, model_kwargs, z: Sites) -> tuple[Array, Sites]:
     """rest(θ), and log p(v_s | θ, z_s) of every site that noise drives, shaped as its batch."""
     parts = _Split(numpyro.handlers.seed(model, 0))
-    rest = potential_energy(parts, model_args, model_kwargs, z)
+    rest = jnp.asarray(potential_energy(parts, model_args, model_kwargs, z))
     return rest, parts.log_likelihood
 
 
@@ -70,12 +70,12 @@ def misfit(model, model_args, model_kwargs, z: Sites) -> Array:
     return rest - sum(map(jnp.sum, log_likelihood.values()))
 
 
-def energies_of(model, model_args, model_kwargs, z: Sites, owners) -> tuple[Array, ...]:
-    """Energies -log p(v_s | θ, z_s), an array for each noise; the one energy Φ where `owners` is `None`."""
+def energies_of(model, model_args, model_kwargs, z: Sites, owners) -> tuple[Array, tuple[Array, ...]]:
+    """`rest`, and energies -log p(v_s | θ, z_s), an array for each noise; 0 and Φ where `owners` is `None`."""
+    rest, log_likelihood = split(model, model_args, model_kwargs, z)
     if owners is None:
-        return (misfit(model, model_args, model_kwargs, z),)
-    _, log_likelihood = split(model, model_args, model_kwargs, z)
-    return tuple(-log_likelihood[owners[noise]] for noise in sorted(owners))
+        return jnp.zeros_like(rest), (rest - sum(map(jnp.sum, log_likelihood.values())),)
+    return rest, tuple(-log_likelihood[owners[noise]] for noise in sorted(owners))
 
 
 def driven_by(model, model_args, model_kwargs, z: Sites, noise=None) -> dict[str, str] | None:
@@ -93,6 +93,11 @@ def driven_by(model, model_args, model_kwargs, z: Sites, noise=None) -> dict[str
             return None
         driven[min(sources)] = site
     return driven if set(driven) == noise and not rest else None
+
+
+def groups_of(noise, owners) -> list[tuple[str, ...]]:
+    """Names of the noise of each energy."""
+    return [tuple(sorted(noise))] if owners is None else [(name,) for name in sorted(noise)]
 
 
 def _inputs_of(jaxpr, out) -> set[int]:

@@ -57,7 +57,8 @@ _no_moments, _add, _ = welford_covariance(diagonal=False)
 
 
 def start_windows(reference: Reference) -> Windows:
-    return Windows(reference, _no_moments(reference.mean.size))
+    mean, m2, n = _no_moments(reference.mean.size)
+    return Windows(reference, (mean, m2, n))
 
 
 def update_windows(windows: Windows, i: Array, num_warmup: int, theta: Array) -> tuple[Windows, Array]:

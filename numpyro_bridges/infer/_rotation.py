@@ -19,7 +19,7 @@ def kick(p, force, time):
     return jax.tree.map(lambda p, f, t: p + t * f, p, force, time), change
 
 
-def metropolis(key, error):
+def metropolis(key, error: jax.Array):
     """Acceptance probabilities exp(-error), 0 where it is NaN, and decisions drawn with them."""
     rate = jnp.exp(-jnp.maximum(jnp.where(jnp.isnan(error), jnp.inf, error), 0.0))
     return rate, jr.uniform(key, rate.shape, rate.dtype) < rate
@@ -30,11 +30,13 @@ def half_square(x):
     return 0.5 * total(jax.tree.map(jnp.square, x))
 
 
-def total(x):
-    return sum(map(jnp.sum, jax.tree.leaves(x)))
+def total(x) -> jax.Array:
+    return sum((jnp.sum(leaf) for leaf in jax.tree.leaves(x)), start=jnp.zeros(()))
 
 
-def normal_like(key, x):
+def normal_like(key, x, shape: tuple[int, ...] = ()):
+    """Standard normal draws, with further axes in front."""
     leaves, treedef = jax.tree.flatten(x)
     keys = jr.split(key, len(leaves))
-    return jax.tree.unflatten(treedef, [jr.normal(k, a.shape, a.dtype) for k, a in zip(keys, leaves, strict=True)])
+    draws = [jr.normal(k, shape + a.shape, a.dtype) for k, a in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(treedef, draws)

@@ -1,0 +1,32 @@
+"""Step sizes that adapt to a target acceptance by NumPyro's dual averaging, within bounds."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from numpyro.infer.hmc_util import dual_averaging
+
+_start, _update = dual_averaging()
+
+
+class StepSize(NamedTuple):
+    """The step in use, and the state of its averaging."""
+
+    value: Array
+    averaging: tuple
+
+
+def start_step_size(value: Array) -> StepSize:
+    log_value: Any = jnp.log(value)
+    return StepSize(value, _start(log_value))
+
+
+def update_step_size(step: StepSize, shortfall, bounds, *, renew, last) -> StepSize:
+    """After a draw with acceptance `shortfall` below target. `renew`: starts again at the mean; `last`: stays there."""
+    averaging = _update(shortfall, step.averaging)
+    log_value, log_mean = averaging[:2]
+    mean = jnp.clip(jnp.exp(log_mean), *bounds)
+    value = jnp.where(renew | last, mean, jnp.clip(jnp.exp(log_value), *bounds))
+    again = start_step_size(mean)
+    return jax.tree.map(lambda again, on: jnp.where(renew, again, on), again, StepSize(value, averaging))
