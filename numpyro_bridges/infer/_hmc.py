@@ -1,4 +1,6 @@
-"""Hamiltonian Monte Carlo on function space [Beskos2011]_, jointly for noise and parameters.
+"""Hamiltonian Monte Carlo on function space, jointly for noise and parameters.
+
+Beskos, Pinski, Sanz-Serna and Stuart (2011), for the noise.
 
 With x = (y, z), y the parameters whitened by their reference, and standard normal momentum p,
 

@@ -1,4 +1,6 @@
-"""Preconditioned Crank-Nicolson moves of the noise [Cotter2013]_, for `Gibbs` beside a kernel of the parameters.
+"""Preconditioned Crank-Nicolson moves of the noise, for `Gibbs` beside a kernel of the parameters.
+
+Cotter, Roberts, Stuart and White (2013).
 
 A move turns the noise z by an angle φ towards an independent p ~ N(0, I),
 

@@ -1,4 +1,6 @@
-"""Correlated pseudo-marginal Metropolis-Hastings [Andrieu2009, Deligiannidis2018]_.
+"""Correlated pseudo-marginal Metropolis-Hastings.
+
+Andrieu and Roberts (2009); Deligiannidis, Doucet and Pitt (2018).
 
 The likelihood of each datum is estimated by the mean of the weights of N bridges, which is unbiased,
 
@@ -206,7 +208,7 @@ class CorrelatedPseudoMarginal(AbstractPseudoMarginal):
       if `max_particles` do not suffice. Where one particle has a standard deviation below 1, the guide is good.
     - `correlation`: ρ, of the noise of successive proposals.
     - `step_size`: of the walk, in units of the parameters' reference, a Laplace approximation that is renewed in the
-      warm-up. By default 2.56 / √d for d parameters [Sherlock2015]_.
+      warm-up. By default 2.56 / √d for d parameters (Sherlock, Thiery, Roberts and Rosenthal, 2015).
     - `init_strategy`: as for `FunctionSpaceHMC`.
 
     The noise of the posterior is that of one particle for each datum: paths can be had from it as from any kernel.
@@ -222,7 +224,7 @@ class CorrelatedPseudoMarginal(AbstractPseudoMarginal):
 class CorrelatedPseudoMarginalMALA(AbstractPseudoMarginal):
     """`CorrelatedPseudoMarginal` whose parameters are proposed by the Metropolis-adjusted Langevin algorithm.
 
-    Its default step is 1.65 / d^(1/6) [Roberts1998]_.
+    Its default step is 1.65 / d^(1/6) (Roberts and Rosenthal, 1998).
     """
 
     def _evaluate(self, potential, theta):
