@@ -2,14 +2,18 @@
 
 import warnings
 
+import jax
 import jax.random as jr
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
-from numpyro.infer import MCMC, NUTS, log_likelihood
+import xarray
+from numpyro.infer import HMC, MCMC, NUTS, Gibbs, log_likelihood
+from numpyro.util import nested_attrgetter
 
 import numpyro_bridges as nb
+from numpyro_bridges.infer._statistics import statistics
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # ArviZ 0.x announces 1.x when it is imported
@@ -17,7 +21,7 @@ with warnings.catch_warnings():
 
 pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
 
-N, STEPS = 6, 2
+N, STEPS, PATHS = 6, 2, 4
 DATA = np.random.default_rng(0).normal(0.5, 0.6, (N, 2))
 
 
@@ -32,12 +36,40 @@ def model(data=None, n=N):
         nb.sample("wing", law, obs=data)
 
 
+def two_sites(data):
+    """Bridges on two grids, the end of one a parameter, and a datum that no noise drives."""
+    mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
+    end = numpyro.sample("end", dist.LogNormal(0.0, 0.1))
+    sde = nb.LinearSDE(-1.0, 0.6, mean)
+    wing = nb.DiffusionEndpoint(sde, np.zeros((2, 1)), nb.InexactMatch(0.1), t1=1.0, num_steps=STEPS)
+    with numpyro.plate("specimens", 3):
+        nb.sample("wing", wing, obs=data)
+    leg = nb.DiffusionEndpoint(sde, np.zeros(2), nb.InexactMatch(0.1), t1=end, num_steps=STEPS + 1)
+    nb.sample("leg", leg, obs=np.zeros(2))
+    numpyro.sample("size", dist.Normal(mean, 1.0), obs=0.3)
+
+
+WINGS = np.linspace(-1, 1, 6).reshape(3, 2, 1)
+
+
+def made_up_run(kernel, samples=None, **fields):
+    """A run of `two_sites` with draws that nothing had to compile, 2 chains of 7."""
+    rng = np.random.default_rng(1)
+    if samples is None:
+        shapes = {"mean": (), "end": (), "wing_noise": (3, STEPS, 2, 1), "leg_noise": (STEPS + 1, 2, 1)}
+        samples = {name: rng.normal(size=(2, 7, *shape)) for name, shape in shapes.items()}
+        samples["end"] = np.exp(0.1 * samples["end"])
+    mcmc = MCMC(kernel, num_warmup=0, num_samples=7, num_chains=2, chain_method="sequential", progress_bar=False)
+    mcmc._states, mcmc._args, mcmc._kwargs = {"z": samples, **fields}, (WINGS,), {}
+    return mcmc
+
+
 @pytest.fixture(scope="module")
 def mcmc():
     mcmc = MCMC(
         NUTS(model), num_warmup=100, num_samples=150, num_chains=2, chain_method="sequential", progress_bar=False
     )
-    mcmc.run(jr.key(0), DATA, extra_fields=nb.infer.HMC_FIELDS)
+    mcmc.run(jr.key(0), DATA, extra_fields=nb.infer.fields(mcmc.sampler))
     return mcmc
 
 
@@ -45,7 +77,7 @@ def mcmc():
 def data(mcmc):
     """With what `Predictive` returns; made up, which compiles nothing."""
     prior = {"mean": np.zeros(7), "wing": np.zeros((7, N, 2)), "wing_noise": np.zeros((7, N, STEPS, 2, 1))}
-    return nb.to_arviz(mcmc, prior=prior, posterior_predictive={"wing": np.zeros((300, N, 2))})
+    return nb.to_arviz(mcmc, prior=prior, posterior_predictive={"wing": np.zeros((300, N, 2))}, paths=PATHS)
 
 
 def test_posterior_is_without_the_noise(mcmc, data):
@@ -98,6 +130,115 @@ def test_data_and_predictions(data):
     assert data.posterior_predictive["wing"].shape == (2, 150, N, 2)
     assert "mean" in data.prior and "wing_noise" not in data.prior
     assert data.prior_predictive["wing"].shape == (1, 7, N, 2)
+
+
+def test_paths_are_those_of_the_bridges(mcmc, data):
+    paths, samples = data["posterior_paths"]["wing"], mcmc.get_samples(group_by_chain=True)
+    assert paths.dims == ("chain", "draw", "specimens", "time", "coordinate")
+    assert paths.shape == (2, PATHS, N, STEPS + 1, 2)
+    np.testing.assert_array_equal(paths["draw"], [0, 49, 99, 149])
+    np.testing.assert_allclose(paths["time"], [0, 0.5, 1])
+
+    @jax.jit
+    def path(mean, noise, observed):
+        sde = nb.LinearSDE(-1.0, 0.6, mean)
+        seen = nb.InexactMatch(0.1).at(observed)
+        return nb.GuidedBridge(sde, seen, x0=np.zeros(2), t1=1.0, num_steps=STEPS).path(noise)
+
+    for chain, draw, i in [(0, 0, 0), (1, 49, 3), (0, 149, 5)]:
+        expected = path(samples["mean"][chain, draw], samples["wing_noise"][chain, draw, i], DATA[i])
+        np.testing.assert_allclose(paths.sel(chain=chain, draw=draw, specimens=i), expected, rtol=1e-12)
+
+
+def test_netcdf(data, tmp_path):
+    data.to_netcdf(str(tmp_path / "run.nc"), engine="h5netcdf")
+    with xarray.open_dataset(tmp_path / "run.nc", group="posterior_paths", engine="h5netcdf") as read:
+        xarray.testing.assert_equal(read["wing"].load(), data["posterior_paths"]["wing"])
+
+
+@pytest.fixture(scope="module")
+def several():
+    coords = {"specimens": ["a", "b", "c"], "draw": np.arange(10, 17)}
+    kernel = Gibbs([(nb.infer.PCN(two_sites), nb.infer.noise_sites), (NUTS(two_sites), None)])
+    fields = {name: np.full((2, 7), name.startswith("block_states.1.")) for name in nb.infer.fields(kernel)[-1:]}
+    return nb.to_arviz(made_up_run(kernel, **fields), paths=100, coords=coords)
+
+
+def test_paths_of_several_sites(several):
+    paths = several["posterior_paths"]
+    assert paths["wing"].dims == ("chain", "draw", "specimens", "wing_time", "point", "wing_coordinate")
+    assert paths["leg"].dims == ("chain", "draw", "leg_time", "leg_coordinate")
+    assert list(paths["draw"]) == list(range(10, 17)) and list(paths["specimens"]) == ["a", "b", "c"]
+    np.testing.assert_allclose(paths["wing_time"], [0, 0.5, 1])
+    np.testing.assert_array_equal(paths["leg_times"][..., -1], several.posterior["end"])
+    assert np.all(paths["leg"][:, :, 0] == 0) and np.all(np.abs(paths["leg"][:, :, -1]) < 2)
+
+
+def test_run_of_gibbs(several):
+    assert set(several.posterior.data_vars) == {"mean", "end"}
+    assert set(several.log_likelihood.data_vars) == {"wing", "leg", "size"}
+    assert set(several.sample_stats.data_vars) == {"nuts_diverging", "diverging"}
+    assert several.sample_stats["diverging"].all()
+
+
+def test_without_noise(several):
+    samples = made_up_run(NUTS(two_sites)).get_samples(group_by_chain=True)
+    del samples["wing_noise"]
+    mcmc = made_up_run(NUTS(two_sites), samples)
+    found = nb.to_arviz(mcmc).log_likelihood
+    assert set(found.data_vars) == {"leg", "size"}
+    np.testing.assert_allclose(found["size"], dist.Normal(samples["mean"], 1.0).log_prob(0.3))
+    np.testing.assert_allclose(found["leg"], several.log_likelihood["leg"], rtol=1e-12)
+    with pytest.raises(ValueError, match=r"has not kept \['wing_noise'\]. Run it without \['~z.wing_noise'\]"):
+        nb.to_arviz(mcmc, paths=2)
+
+
+def test_paths_that_cannot_be():
+    def no_bridge(data):
+        numpyro.sample("size", dist.Normal(numpyro.sample("mean", dist.Normal()), 1.0).expand(data.shape), obs=data)
+
+    mcmc = made_up_run(NUTS(no_bridge), {"mean": np.zeros((2, 7))})
+    with pytest.raises(ValueError, match=r"`paths` needs an observed `DiffusionEndpoint`; .* \['size'\]"):
+        nb.to_arviz(mcmc, paths=2)
+    with pytest.raises(ValueError, match="`paths` must be a positive integer; got 0"):
+        nb.to_arviz(mcmc, paths=0)
+
+
+def kernels():
+    pcn, fields = nb.infer.PCN(two_sites), ("lp", "acceptance_rate", "diverging")
+    hmc = (*fields, "energy", "n_steps", "step_size")
+    return [
+        (HMC(two_sites), hmc),
+        (nb.infer.FunctionSpaceHMC(two_sites), hmc),
+        (nb.infer.CorrelatedPseudoMarginal(two_sites, 2), (*fields, "step_size")),
+        (
+            Gibbs([(pcn, nb.infer.noise_sites), (NUTS(two_sites), None)]),
+            ("diverging", *(f"pcn_{f}" for f in fields), *(f"nuts_{f}" for f in (*hmc, "tree_depth"))),
+        ),
+        (
+            Gibbs([(pcn, ["wing_noise"]), (pcn, ["leg_noise"]), (nb.infer.FunctionSpaceHMC(two_sites), None)]),
+            ("diverging", *(f"pcn{i}_{f}" for i in (0, 1) for f in fields), *(f"functionspacehmc_{f}" for f in hmc)),
+        ),
+    ]
+
+
+@pytest.mark.parametrize("kernel, names", kernels(), ids=["hmc", "function_space", "pseudo_marginal", "gibbs", "three"])
+def test_statistics_of_every_kernel(kernel, names):
+    fields = nb.infer.fields(kernel)
+    values = {name: np.arange(1.0, 15.0).reshape(2, 7) for name in fields}
+    flags = [name for name in fields if name.endswith("diverging")]
+    values |= {name: np.arange(14).reshape(2, 7) == i for i, name in enumerate(flags)}
+    stats = statistics(values, kernel)
+    assert set(stats) == set(names)
+    assert np.sum(stats["diverging"]) == len(flags)
+    np.testing.assert_array_equal(next(stats[name] for name in stats if name.endswith("lp"))[0, 0], -1.0)
+
+
+@pytest.mark.parametrize("kernel", [kernel for kernel, _ in kernels()[:4]], ids=lambda kernel: type(kernel).__name__)
+def test_fields_are_in_the_states(kernel):
+    fields = nb.infer.fields(kernel)
+    state = jax.eval_shape(lambda key: kernel.init(key, 5, None, (WINGS,), {}), jr.key(0))
+    assert all(value.shape == () for value in nested_attrgetter(*fields)(state))
 
 
 def test_samplers_without_a_model():

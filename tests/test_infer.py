@@ -1,5 +1,7 @@
 """The MCMC kernels: exact, in NumPyro's contract, and with an acceptance that does not depend on the grid."""
 
+import pickle
+
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -20,6 +22,7 @@ from numpyro_bridges.infer import (
     FunctionSpaceHMC,
     noise_sites,
 )
+from numpyro_bridges.infer._pseudo_marginal import _choose
 
 DATA = np.random.default_rng(0).normal(0.5, 0.5, (3, 2))
 
@@ -192,3 +195,117 @@ def test_acceptance_does_not_depend_on_the_grid(kernel):
         rates.append(float(np.mean(mcmc.get_extra_fields()["accept_prob"])))
     assert 0.3 < rates[0] < 0.99
     assert np.ptp(rates) < 0.03, rates
+
+
+def discrete(data):
+    numpyro.sample("which", dist.Bernoulli(0.5))
+    conjugate(data)
+
+
+def no_noise(data):
+    numpyro.sample("x", dist.Normal(numpyro.sample("mean", dist.Normal()), 1.0), obs=data[0, 0])
+
+
+NOISE_ONLY = numpyro.handlers.condition(conjugate, {"mean": 0.3})
+REFUSED = {
+    "model": (lambda: FunctionSpaceHMC(3), "`model` must be a NumPyro model"),
+    "discrete": (lambda: FunctionSpaceHMC(discrete), r"cannot draw the discrete sites \['which'\]"),
+    "no noise": (lambda: FunctionSpaceHMC(no_noise), "found no driving noise among the latent sites"),
+    "step": (lambda: FunctionSpaceHMC(conjugate, step_size=0.0), "`step_size` must be positive; got 0.0"),
+    "target": (lambda: FunctionSpaceHMC(conjugate, target_accept_prob=1.0), r"must be in \(0, 1\); got 1.0"),
+    "length": (lambda: FunctionSpaceHMC(conjugate, trajectory_length=-1.0), "`trajectory_length` must be positive"),
+    "jitter": (lambda: FunctionSpaceHMC(conjugate, jitter=1.0), r"`jitter` must be in \[0, 1\); got 1.0"),
+    "PCN with parameters": (lambda: PCN(conjugate), r"moves noise alone, and the model has parameters, \['mean'\]"),
+    "angle": (lambda: PCN(NOISE_ONLY, angle=2.0), r"`angle` must be in \(0, π/2\]; got 2.0"),
+    "moves": (lambda: PCN(NOISE_ONLY, num_moves=0), "`num_moves` must be a positive integer; got 0"),
+    "blocks": (lambda: PCN(NOISE_ONLY, num_blocks=5), r"`num_blocks` must be at most the number of time steps"),
+    "no parameters": (lambda: CorrelatedPseudoMarginal(NOISE_ONLY, 2), "the model has none but its noise"),
+    "particles": (lambda: CorrelatedPseudoMarginal(conjugate, 0), "`num_particles` must be a positive integer; got 0"),
+    "correlation": (lambda: CorrelatedPseudoMarginal(conjugate, 2, correlation=1.0), r"must be in \[0, 1\); got 1.0"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refusals(case):
+    build, message = REFUSED[case]
+    with pytest.raises(ValueError, match=message):
+        build().init(jr.key(0), 10, None, (DATA,), {})
+
+
+def test_a_start_of_density_zero_is_refused():
+    with pytest.raises(ValueError, match="potential energy is (nan|inf|-inf) at the start: give other `init_params`"):
+        FunctionSpaceHMC(conjugate).init(jr.key(0), 10, {"mean": jnp.array(jnp.nan)}, (DATA,), {})
+
+
+def test_sample_before_init_is_refused():
+    kernel = FunctionSpaceHMC(conjugate)
+    state = kernel.init(jr.key(0), 10, None, (DATA,), {})
+    with pytest.raises(ValueError, match="`init` must be called before `sample`"):
+        pickle.loads(pickle.dumps(kernel)).sample(state, (DATA,), {})
+
+
+def test_number_of_particles():
+    """The smallest by which the log estimate varies by at most 1.7; a warning where it cannot be had."""
+    normal = np.random.default_rng(0).normal(0, 1, (256, 4))
+    assert _choose([normal], 64) == 2 and _choose([0.1 * normal], 64) == 1
+    assert 8 <= _choose([2.0 * normal], 64) <= 64
+    with pytest.warns(UserWarning, match="of 4 particles has a standard deviation of .*: above 1.7 the chain sticks"):
+        assert _choose([6.0 * normal], 4) == 4
+    kernel = CorrelatedPseudoMarginal(conjugate)
+    kernel.init(jr.key(0), 10, None, (DATA,), {})
+    assert kernel.num_particles in (1, 2, 3)
+
+
+def shared_noise(data):
+    """Two data driven by one noise, which no single decision about one of them can move."""
+    law = nb.DiffusionEndpoint(nb.LinearSDE(-1.0, 0.6), np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4)
+    noise = numpyro.sample("noise", law.noise_prior(), infer={"driving_noise": True})
+    numpyro.sample("a", law.given(noise), obs=data[0])
+    numpyro.sample("b", law.given(noise), obs=data[1])
+
+
+def used_elsewhere(data):
+    law = nb.DiffusionEndpoint(nb.LinearSDE(-1.0, 0.6), np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4)
+    noise = numpyro.sample("noise", law.noise_prior(), infer={"driving_noise": True})
+    numpyro.sample("a", law.given(noise), obs=data[0])
+    numpyro.factor("more", -jnp.sum(noise**2))
+
+
+def test_which_data_are_decided_on_their_own():
+    def owners(model):
+        kernel = PCN(model)
+        state = kernel.init(jr.key(0), 10, None, (DATA,), {})
+        return kernel._owners, [energy.shape for energy in state.energies]
+
+    assert owners(NOISE_ONLY) == ({"wing_noise": "wing"}, [(3,)])
+    assert owners(shared_noise) == (None, [()])
+    assert owners(used_elsewhere) == (None, [()])
+
+
+def test_noise_with_another_use_has_its_posterior():
+    """A factor exp(-|z|²) on a standard normal noise of constant weight leaves a variance of 1/3."""
+    mcmc = run(PCN(used_elsewhere), DATA, num_samples=4000)
+    noise = np.asarray(mcmc.get_samples()["noise"])
+    assert np.var(noise) == pytest.approx(1 / 3, rel=0.03)
+
+
+def test_chain_methods_and_pickling():
+    """One chain of `vectorized` is the chain of `sequential`; a pickled kernel runs the same chain."""
+    kernel = FunctionSpaceHMC(conjugate)
+    settings = dict(num_warmup=30, num_samples=20, num_chains=2, progress_bar=False)
+    draws = []
+    for method in ("vectorized", "sequential"):
+        mcmc = MCMC(pickle.loads(pickle.dumps(kernel)), chain_method=method, **settings)
+        mcmc.run(jr.key(0), DATA)
+        draws.append(np.asarray(mcmc.get_samples(group_by_chain=True)["mean"]))
+    np.testing.assert_allclose(draws[0], draws[1], rtol=1e-6)
+    assert pickle.loads(pickle.dumps(mcmc)).get_samples()["mean"].shape == (40,)
+
+
+def test_chains_start_near_the_mode():
+    """The Laplace approximation of a normal posterior is that posterior: no transient is left to the warm-up."""
+    state = FunctionSpaceHMC(conjugate).init(jr.split(jr.key(0), 200), 0, None, (DATA,), {})
+    mean, sd = conjugate_posterior()
+    start = np.asarray(state.z["mean"])
+    assert abs(start.mean() - mean) < 0.5 * sd and 0.8 < start.std() / sd < 1.25
+    assert np.all(np.asarray(state.z["wing_noise"]) == 0)

@@ -1,6 +1,7 @@
 """Inference: MCMC kernels made for driving noise, and what NumPyro's leave to do."""
 
-from ._arviz import HMC_FIELDS as HMC_FIELDS, to_arviz as to_arviz
+from ._arviz import to_arviz as to_arviz
+from ._checkpoint import run_checkpointed as run_checkpointed
 from ._hmc import FunctionSpaceHMC as FunctionSpaceHMC, FunctionSpaceHMCState as FunctionSpaceHMCState
 from ._pcn import PCN as PCN, PCNL as PCNL, PCNState as PCNState
 from ._posterior import init_to_guided_mean as init_to_guided_mean, noise_sites as noise_sites
@@ -9,3 +10,4 @@ from ._pseudo_marginal import (
     CorrelatedPseudoMarginalMALA as CorrelatedPseudoMarginalMALA,
     PseudoMarginalState as PseudoMarginalState,
 )
+from ._statistics import fields as fields

@@ -9,19 +9,13 @@ the bridge's weights adds to that of the importance ratios: read Pareto k̂.
 import jax
 import numpy as np
 import numpyro
-from numpyro.infer import MCMC, init_to_sample, log_likelihood
+from numpyro.infer import MCMC, init_to_sample
+from numpyro.ops.provenance import eval_provenance
 
-from .._checks import require
-
-HMC_FIELDS = ("potential_energy", "energy", "accept_prob", "num_steps", "adapt_state.step_size", "diverging")
-"""What HMC and NUTS can report: `mcmc.run(key, data, extra_fields=HMC_FIELDS)`."""
-
-_ARVIZ_NAMES = {
-    "potential_energy": "lp",
-    "accept_prob": "acceptance_rate",
-    "num_steps": "n_steps",
-    "adapt_state.step_size": "step_size",
-}
+from .._checks import positive_integer, require
+from ..distributions import DiffusionEndpoint
+from ._posterior import is_noise
+from ._statistics import statistics
 
 
 def to_arviz(
@@ -32,36 +26,81 @@ def to_arviz(
     coords: dict | None = None,
     dims: dict | None = None,
     noise: bool = False,
+    paths: int | None = None,
 ):
     """The result of an MCMC run, for ArviZ.
 
     **Arguments:**
 
-    - `mcmc`: after `run`. Sample statistics are what the run has collected: `extra_fields=HMC_FIELDS` asks for all.
+    - `mcmc`: after `run`, with any kernel of a model. Sample statistics are what the run has collected:
+      `extra_fields=nb.infer.fields(kernel)` asks for all.
     - `prior`, `posterior_predictive`: dictionaries from `numpyro.infer.Predictive`.
     - `coords`, `dims`: as in ArviZ; plates name their axes.
     - `noise`: keep the driving noise in the posterior.
+    - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all; none by default.
 
-    **Returns:** an `InferenceData` (ArviZ 0.x) or a `DataTree` (1.x) with `posterior`, `sample_stats`, `log_likelihood`
-    with one value for each datum of each observed site (`numpyro.factor` sites are no data), `observed_data`, and the
-    groups of the dictionaries.
+    **Returns:** an `InferenceData` (ArviZ 0.x) or a `DataTree` (1.x) with the groups of the dictionaries and
+
+    - `posterior`, and `observed_data`.
+    - `log_likelihood`: one value for each datum of each observed site (`numpyro.factor` sites are no data). Left out
+      are sites that need what the run has not kept, such as noise dropped by `extra_fields=("~z.wing_noise",)`.
+    - `sample_stats`: under ArviZ's names. Those of a block of `Gibbs` have the class of its kernel in front,
+      `pcn_acceptance_rate`, numbered where blocks share it, `nuts0_lp`; a draw is `diverging` if any block was.
+    - `posterior_paths`: for each observed `DiffusionEndpoint` the bridges, with axes `chain`, `draw`, the plates,
+      `time`, `point` (unless states are vectors) and `coordinate`. An axis in which sites differ has the site's name in
+      front, `wing_time`. Times that vary with the draws are a variable, `wing_times`.
+
+    **Errors:** `ValueError` for a kernel without a model, and for `paths` without such a site, or without its noise.
     """
     model = getattr(mcmc.sampler, "model", None)
     require(callable(model), "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.")
     sites = _sites(model, mcmc._args, mcmc._kwargs)
     observed = {name: site["value"] for name, site in sites.items() if _is_datum(site)}
-    hidden = set() if noise else {name for name, site in sites.items() if _is_noise(site)}
+    hidden = set() if noise else {name for name, site in sites.items() if is_noise(site)}
+    dims = _plates(sites) | (dims or {})
+    samples = mcmc.get_samples(group_by_chain=True)
+    shape = next(iter(samples.values())).shape[:2]
+    lost = {name: site["value"] for name, site in sites.items() if _is_latent(site) and name not in samples}
+
+    def replay(values, names):
+        at_values = numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), data=values)
+        trace = numpyro.handlers.trace(at_values).get_trace(*mcmc._args, **mcmc._kwargs)
+        return {name: (trace[name]["fn"], trace[name]["value"]) for name in names}
+
+    def log_likelihood(values, names):
+        return {name: law.log_prob(value) for name, (law, value) in replay(values, names).items()}
+
+    def bridges(values, names):
+        return {name: (law.path(value), law.parts["ts"]) for name, (law, value) in replay(values, names).items()}
 
     def visible(draws, shape=None):
         return {k: v if shape is None else _regrouped(v, shape) for k, v in draws.items() if k not in hidden}
 
-    samples = mcmc.get_samples(group_by_chain=True)
-    shape = next(iter(samples.values())).shape[:2]
-    log_lik = log_likelihood(model, mcmc.get_samples(), *mcmc._args, **mcmc._kwargs) if observed else {}
+    def unknown(fn, names):
+        """Names of the sites for which `fn` needs what is lost."""
+        first = {name: value[0, 0] for name, value in samples.items()}
+        needs = eval_provenance(lambda lost: fn(first | lost, names), lost=lost) if lost else {}
+        return {name for name, sources in needs.items() if frozenset().union(*jax.tree.leaves(sources))}
+
+    lacking = unknown(log_likelihood, observed)
+    known = [name for name in observed if name not in lacking]
+    datasets = {}
+    if paths is not None:
+        kept = np.linspace(0, shape[1] - 1, min(positive_integer(paths, "paths"), shape[1])).astype(int)
+        driven = [name for name in observed if isinstance(sites[name]["fn"], DiffusionEndpoint)]
+        require(driven, f"`paths` needs an observed `DiffusionEndpoint`; the model observes {sorted(observed)}.")
+        require(
+            not unknown(bridges, driven),
+            f"`paths` needs the noise that drives {driven}, and the run has not kept {sorted(lost)}. Run it without "
+            f"{[f'~z.{name}' for name in sorted(lost)]} in `extra_fields`; if it is checkpointed, with `keep_noise=1`.",
+        )
+        found = _mapped(lambda draw: bridges(lost | draw, driven), samples, kept)
+        leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven}
+        datasets["posterior_paths"] = _labelled(found, leading, kept, coords or {})
     groups = {
         "posterior": visible(samples),
-        "sample_stats": _statistics(mcmc.get_extra_fields(group_by_chain=True)),
-        "log_likelihood": {name: _regrouped(log_lik[name], shape) for name in observed},
+        "sample_stats": statistics(mcmc.get_extra_fields(group_by_chain=True), mcmc.sampler),
+        "log_likelihood": _mapped(lambda draw: log_likelihood(lost | draw, known), samples) if known else {},
         "observed_data": observed,
     }
     if posterior_predictive is not None:
@@ -71,7 +110,7 @@ def to_arviz(
         groups["prior"] = {name: value for name, value in draws.items() if name not in observed}
         groups["prior_predictive"] = {name: value for name, value in draws.items() if name in observed}
     groups = {group: jax.device_get(values) for group, values in groups.items() if values}
-    return _from_groups(groups, coords, _plates(sites) | (dims or {}))
+    return _from_groups(groups, datasets, coords, dims)
 
 
 def _sites(model, args, kwargs) -> dict:
@@ -81,12 +120,12 @@ def _sites(model, args, kwargs) -> dict:
     return {name: site for name, site in trace.items() if site["type"] in ("sample", "deterministic")}
 
 
+def _is_latent(site) -> bool:
+    return site["type"] == "sample" and not site["is_observed"]
+
+
 def _is_datum(site) -> bool:
     return bool(site.get("is_observed")) and not site["infer"].get("is_auxiliary")
-
-
-def _is_noise(site) -> bool:
-    return bool(site.get("infer", {}).get("driving_noise"))
 
 
 def _plates(sites) -> dict:
@@ -95,25 +134,67 @@ def _plates(sites) -> dict:
     return {name: [frame.name for frame in stack] for name, stack in frames.items() if stack}
 
 
+def _leading_axes(name, number, dims) -> list[str]:
+    """Of one site: as many names as it has axes for its data."""
+    names = list(dims.get(name, ()))[:number]
+    return names + [f"{name}_dim_{i}" for i in range(len(names), number)]
+
+
 def _regrouped(draws, shape):
     """Draws with chains and iterations in front."""
     draws = np.asarray(draws)
     return draws.reshape(shape + draws.shape[1:])
 
 
-def _statistics(fields) -> dict:
-    """Sample statistics under ArviZ's names."""
-    named = {_ARVIZ_NAMES.get(name, name): value for name, value in fields.items() if hasattr(value, "shape")}
-    if "lp" in named:
-        named["lp"] = -named["lp"]
-    if "n_steps" in named:
-        named["tree_depth"] = np.log2(np.asarray(named["n_steps"])).astype(int) + 1
-    return named
+def _mapped(fn, samples, kept=None) -> dict:
+    """`fn` of every draw, or of those kept: chain by chain and a few draws at once, which bounds the memory."""
+    chains, draws = next(iter(samples.values())).shape[:2]
+    number, kept = (draws, slice(None)) if kept is None else (len(kept), kept)
+    at_once = max(n for n in range(1, 9) if number % n == 0)  # a remainder would be compiled once more
+    program = jax.jit(lambda values: jax.lax.map(fn, values, batch_size=at_once))
+    done = [program({name: np.asarray(value[c])[kept] for name, value in samples.items()}) for c in range(chains)]
+    return jax.tree.map(lambda *parts: np.stack(parts), *done)
 
 
-def _from_groups(groups, coords, dims):
+def _labelled(found, leading, kept, coords):
+    """A dataset of the bridges and times of each site, with axes `(chain, draw, ..., time, point, coordinate)`."""
+    import xarray
+
+    grids = {name: _grid(path[0, 0], times, len(leading[name])) for name, (path, times) in found.items()}
+    taken = set().union(*leading.values())
+
+    def label(name, axis):
+        agreed = len({grid[axis] for grid in grids.values() if axis in grid}) == 1
+        return axis if agreed and axis not in taken else f"{name}_{axis}"
+
+    variables, labels = {}, {"draw": np.asarray(coords.get("draw", range(kept[-1] + 1)))[kept]}
+    for name, (path, times) in found.items():
+        axes = [label(name, axis) for axis in grids[name]]
+        variables[name] = (["chain", "draw", *leading[name], *axes], path)
+        if isinstance(grids[name]["time"], tuple):
+            labels[axes[0]] = times[0, 0]
+        else:
+            variables[f"{name}_times"] = (["chain", "draw", axes[0]], times)
+    data = xarray.Dataset(variables)
+    given = {axis: coords[axis] for axis, size in data.sizes.items() if len(coords.get(axis, ())) == size}
+    return data.assign_coords({axis: np.arange(size) for axis, size in data.sizes.items()} | given | labels)
+
+
+def _grid(path, times, number) -> dict:
+    """What two sites with a common axis agree in: its length, and the times if they do not vary with the draws."""
+    axes = ("time", "point", "coordinate") if path.ndim - number == 3 else ("time", "coordinate")
+    fixed = {"time": tuple(times[0, 0])} if np.all(times == times[0, 0]) else {}
+    return dict(zip(axes, path.shape[number:], strict=True)) | fixed
+
+
+def _from_groups(groups, datasets, coords, dims):
     import arviz
+    import xarray
 
     if int(arviz.__version__.split(".")[0]) < 1:
-        return arviz.from_dict(**groups, coords=coords, dims=dims)
-    return arviz.from_dict(groups, coords=coords, dims=dims)
+        data = arviz.from_dict(**groups, coords=coords, dims=dims)
+        if datasets:
+            data.add_groups(datasets)
+        return data
+    data = arviz.from_dict(groups, coords=coords, dims=dims)
+    return data.assign({name: xarray.DataTree(dataset) for name, dataset in datasets.items()})

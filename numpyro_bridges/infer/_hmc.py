@@ -83,7 +83,7 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         step_size: float = 1.0,
         target_accept_prob: float = 0.8,
         adapt_step_size: bool = True,
-        trajectory_length: float = 2.0,
+        trajectory_length: float = 2.1,
         jitter: float = 0.2,
         max_num_steps: int = 32,
         init_strategy=init_to_guided_mean,
@@ -106,7 +106,7 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         step = jnp.asarray(self._step_size, phi.dtype)
         adapt = AdaptState(*start_step_size(step), start_windows(reference))
         energy = phi + half_square(self._parts(z)[1])
-        i, zero, no = jnp.array(0), jnp.zeros_like(phi), jnp.array(False)
+        i, zero, no = jnp.zeros((), int), jnp.zeros_like(phi), jnp.array(False)
         return FunctionSpaceHMCState(i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key)
 
     def refresh(self, state, model_args, model_kwargs):

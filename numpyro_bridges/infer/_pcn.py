@@ -84,6 +84,8 @@ class AbstractPCN(AbstractBridgeKernel):
             f"{type(self).__name__} moves noise alone, and the model has parameters, {parameters}: give them a block, "
             f"`Gibbs([({type(self).__name__}(model), noise_sites), (NUTS(model), None)])`.",
         )
+        few = [name for name in z if self._num_blocks > (z[name].shape[-3] if z[name].ndim > 2 else 1)]
+        require(not few, f"`num_blocks` must be at most the number of time steps; {few} have fewer.")
         self._owners = driven_by(self._model, model_args, model_kwargs, z)
         energies, force = self._evaluate(z, model_args, model_kwargs)
         angles = tuple(jnp.full_like(energy, self._angle) for energy in energies)
@@ -205,6 +207,8 @@ def _kicked(p, force, turns):
 
 def _inside(block, num_blocks, noise):
     """1 in a block of the time steps, an axis of the noise `(..., num_steps, k, dim)`; 0 outside."""
+    if num_blocks == 1:
+        return jnp.ones((), noise.dtype)
     steps = noise.shape[-3]
     return (jnp.arange(steps) * num_blocks // steps == block).astype(noise.dtype)[:, None, None]
 

@@ -1,7 +1,7 @@
 """A Gaussian reference N(μ, L Lᵀ) of the posterior of the unconstrained parameters, θ = μ + L y.
 
-It starts as a Laplace approximation with the noise at zero, and is renewed from the draws at the end of each window of
-the warm-up (Stan's schedule). y has the role of the noise: N(0, I) but for what the kernels correct.
+It starts as a Laplace approximation with the noise at zero, and is renewed from the draws at the end of each of two
+windows of the warm-up. y has the role of the noise: N(0, I) but for what the kernels correct.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.optimize import minimize
-from numpyro.infer.hmc_util import build_adaptation_schedule, welford_covariance
+from numpyro.infer.hmc_util import welford_covariance
 
 
 class Reference(NamedTuple):
@@ -63,14 +63,20 @@ def start_windows(reference: Reference) -> Windows:
 
 def update_windows(windows: Windows, i: Array, num_warmup: int, theta: Array) -> tuple[Windows, Array]:
     """Adds draw i of the warm-up; at the end of a window renews the reference. Says whether it did."""
-    schedule = build_adaptation_schedule(num_warmup)[1:-1]
-    if not schedule or not theta.size:
+    starts, ends = _schedule(num_warmup)
+    if num_warmup < 20 or not theta.size:
         return windows, jnp.array(False)
-    inside = (i >= schedule[0].start) & (i <= schedule[-1].end)
-    ends = jnp.any(i == jnp.array([window.end for window in schedule]))
+    inside = (i >= starts[0]) & (i < ends[-1])
+    ends = jnp.any(i + 1 == jnp.array(ends))
     moments = _where(inside, _add(theta, windows.moments), windows.moments)
     renewed = start_windows(_if_finite(_from_moments(*moments), windows.reference))
     return _where(ends, renewed, windows._replace(moments=moments)), ends
+
+
+def _schedule(num_warmup: int):
+    """Starts and ends of two windows. The start is near the mode: all but a tenth before and after can be used."""
+    cuts = [int(fraction * num_warmup) for fraction in (0.1, 0.3, 0.9)]
+    return cuts[:2], cuts[1:]
 
 
 def _from_moments(mean, m2, n) -> Reference:

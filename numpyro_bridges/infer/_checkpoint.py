@@ -1,0 +1,349 @@
+"""MCMC that survives a kill: a run in intervals, each of which is on disk when it ends.
+
+A directory holds NumPy archives,
+
+- `draws_<iteration>.npz`: what was kept of the interval that starts there, `(chains, draws, ...)`: samples as
+  `z/<site>`, extra fields under their names, thinned noise as `noise/<site>`;
+- `state.npz`: the number of iterations done, the states of the chains after them, as `state/<field>` (random keys as
+  their data), and the settings of the run.
+
+A file is written beside its place, synced, and moved there. Draws come first and the state commits them: draws from its
+iteration on belong to an interval that was cut off, and are written anew.
+"""
+
+import copy
+import hashlib
+import json
+import os
+import sys
+import warnings
+from functools import partial
+from pathlib import Path
+from zipfile import BadZipFile
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import numpyro
+from jax.tree_util import keystr, tree_flatten_with_path
+from numpyro.infer import MCMC, init_to_sample
+from numpyro.util import is_prng_key, nested_attrgetter
+from tqdm.auto import tqdm
+
+from .._checks import positive_integer, require
+from ._posterior import noise_sites
+
+
+def run_checkpointed(
+    mcmc: MCMC,
+    path,
+    rng_key,
+    /,
+    *args,
+    interval: int = 100,
+    keep_noise: int | None = None,
+    extra_fields=(),
+    init_params=None,
+    **kwargs,
+) -> None:
+    """`mcmc.run(rng_key, *args, ...)` in intervals that are saved; where a run was cut off, it goes on from there.
+
+        run_checkpointed(mcmc, "wings_run", jax.random.key(0), wings)  # and after a crash: the same line again
+
+    The draws are, bit for bit, those of a run that was never cut off, given the same machine and versions. Afterwards
+    `mcmc` is as after `run`. The same call with a larger `num_samples` makes a chain longer. With thinning by k,
+    draws k, 2k, ... after the warm-up are kept.
+
+    **Arguments:**
+
+    - `mcmc`: of any kernel and chain method. A callable method is applied within `jax.jit`.
+    - `path`: a directory, made if need be, for this run alone and for one process at a time.
+    - `rng_key`, `args`, `kwargs`, `extra_fields`, `init_params`: as for `run`.
+    - `interval`: the number of iterations, warm-up included, between two savings: at most as many are lost to a kill.
+    - `keep_noise`: by default the driving noise of the draws is dropped. With k > 1 every k-th draw's is kept, in
+      `mcmc.get_extra_fields()["noise"]`; with 1 it stays among the samples.
+
+    **Errors:** `ValueError` if `path` holds a run with other settings or arguments, or something else. Ctrl-C raises
+    `KeyboardInterrupt`, after `mcmc` has been given the draws of all complete intervals.
+
+    A change of the model itself, or of what it takes from outside its arguments, shows only in how the chains start; it
+    leads to a warning.
+    """
+    interval = positive_integer(interval, "interval")
+    keep_noise = None if keep_noise is None else positive_integer(keep_noise, "keep_noise")
+    require(mcmc.post_warmup_state is None, "`mcmc` must do its own warm-up: set `mcmc.post_warmup_state` to None.")
+    folder = Path(path)
+    require(folder.is_dir() or not folder.exists(), f"`path` must be a directory, or a new name; {folder} is a file.")
+    chains = _Chains(mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval)
+    state, done = _load_state(folder, chains)
+    total = mcmc.num_warmup + mcmc.num_samples
+    require(
+        done <= total,
+        f"`num_samples` must be {done - mcmc.num_warmup} or more, as many as `path` {folder} holds; got "
+        f"{mcmc.num_samples}.",
+    )
+    divergences = np.sum(_load_draws(folder, chains, done).get("diverging", 0))
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with tqdm(total=total, initial=done, disable=not mcmc.progress_bar) as bar:
+            while done < total:
+                stop = min((done // interval + 1) * interval, total)
+                state, draws = chains.advance(state, done, stop)
+                if draws:
+                    _write(_draws_file(folder, done), draws)
+                _write(folder / "state.npz", chains.record(state, stop))
+                divergences += np.sum(draws.get("diverging", 0))
+                bar.update(stop - done)
+                done = stop
+                if not bar.disable:
+                    bar.set_description("warmup" if done < mcmc.num_warmup else "sample", refresh=False)
+                    count = f"{divergences} divergences" if "diverging" in chains.fields else ""
+                    bar.set_postfix_str(", ".join(filter(None, (chains.diagnostics(state), count))))
+    except KeyboardInterrupt:
+        state, done = _load_state(folder, chains)
+        _hand_over(folder, chains, state, done)
+        print(
+            f"Interrupted: of {total} iterations {done} are in {folder}, and of {mcmc.num_samples} draws "
+            f"{max(done - mcmc.num_warmup, 0)} (before thinning) in `mcmc`. The same call goes on from there.",
+            file=sys.stderr,
+        )
+        raise
+    _hand_over(folder, chains, state, done)
+
+
+class _Chains:
+    """The chains of an `MCMC`, advanced by any number of iterations with one compiled program."""
+
+    def __init__(self, mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval):
+        self.mcmc, self.args, self.kwargs, self.interval = mcmc, args, kwargs, interval
+        self.sampler = copy.copy(mcmc.sampler)  # `init` leaves functions in it
+        names = dict.fromkeys([mcmc._sample_field, *mcmc._default_fields, *extra_fields])
+        self.fields = [name for name in names if not name.startswith("~")]
+        self.removed = {name.removeprefix(f"~{mcmc._sample_field}.") for name in names if name.startswith("~")}
+        self.noise = () if keep_noise == 1 else _noise_of(self.sampler, args, kwargs)
+        self.keep_noise = keep_noise
+        self.batched = mcmc.num_chains > 1 and mcmc.chain_method == "vectorized"
+
+        keys = jr.split(rng_key, mcmc.num_chains) if mcmc.num_chains > 1 and is_prng_key(rng_key) else rng_key
+        init = _over_chains(mcmc, lambda x, _: self.sampler.init(x[0], mcmc.num_warmup, x[1], args, kwargs))
+        start = jax.tree.map(_array, init((keys, jax.tree.map(jnp.asarray, init_params)), ()))
+        self.start = _rebuilt(_named(_plain(start)), start)
+        leaves = jax.tree.leaves(_plain(self.start))
+        self.fingerprint = np.array([np.sum(np.abs(x), dtype=float) for x in leaves])
+        self.draw = jax.eval_shape(self._collect, self.start if self.batched else self._first(self.start))
+        self._program = _over_chains(mcmc, self._advance, jax.jit)
+
+        inputs = {"rng_key": rng_key, "args": args, "kwargs": kwargs, "init_params": init_params}
+        shapes = _named({"draw": self.draw, "state": self.start})
+        self.settings = {
+            "num_warmup": mcmc.num_warmup,
+            "num_chains": mcmc.num_chains,
+            "chain_method": getattr(mcmc.chain_method, "__name__", mcmc.chain_method) if mcmc.num_chains > 1 else None,
+            "thinning": mcmc.thinning,
+            "interval": interval,
+            "keep_noise": keep_noise,
+            "extra_fields": sorted(extra_fields),
+            **_settings_of(self.sampler, "kernel"),
+            **{name: _described(value) for name, value in _named(inputs).items()},
+            **{f"the shape of {name}": f"{x.dtype}{list(x.shape)}" for name, x in shapes.items()},
+        }
+
+    def advance(self, state, begin, end):
+        """The state after iteration `end`, and what is kept since `begin`: arrays `(chains, draws, ...)` by name."""
+        state, draws = self._program(state, (begin, end))
+        kept = {}
+        for name, x in draws.items():
+            x = np.asarray(x)
+            x = x.swapaxes(0, 1) if self.batched else x[None] if self.mcmc.num_chains == 1 else x
+            kept[name] = x[:, : self.count(name, end) - self.count(name, begin)]
+        return _rebuilt(_named(_plain(state)), self.start), kept if any(x.size for x in kept.values()) else {}
+
+    def record(self, state, done):
+        """What `state.npz` holds."""
+        header = {"iterations": done, "settings": json.dumps(self.settings), "start": self.fingerprint}
+        return header | _named({"state": _plain(state)})
+
+    def count(self, name, i):
+        """How many draws the first i iterations leave."""
+        every = self.mcmc.thinning * (self.keep_noise if name.startswith("noise/") else 1)
+        return (i > self.mcmc.num_warmup) * (i - self.mcmc.num_warmup) // every
+
+    def diagnostics(self, state) -> str:
+        return self.sampler.get_diagnostics_str(self._first(state))
+
+    def _first(self, state):
+        """The state of one chain."""
+        one = self.mcmc.num_chains == 1 or self.sampler.is_ensemble_kernel
+        return state if one else _chain(state, 0)
+
+    def _collect(self, state):
+        """The fields of a draw, as `MCMC` has them, and the noise apart."""
+        fields = {name: nested_attrgetter(name)(state) for name in self.fields}
+        constrain = self.mcmc.postprocess_fn or self.sampler.postprocess_fn(self.args, self.kwargs)
+        samples = (jax.vmap(constrain) if self.batched else constrain)(fields[self.mcmc._sample_field])
+        if isinstance(samples, dict):
+            if self.keep_noise and self.noise:
+                fields["noise"] = {k: v for k, v in samples.items() if k in self.noise}
+            samples = {k: v for k, v in samples.items() if k not in self.removed.union(self.noise)}
+        return _plain(jax.tree.map(_array, fields | {self.mcmc._sample_field: samples}))
+
+    def _advance(self, state, bounds):
+        """Iterations of one chain, or of a vectorised batch, between two numbers that are known only when it runs."""
+        begin, end = bounds
+        empty = {k: jnp.zeros(x.shape, x.dtype) for k, x in _named(jax.eval_shape(self._collect, state)).items()}
+        sizes = {name: self.count(name, self.mcmc.num_warmup + self.interval) + 1 for name in empty}
+
+        def step(i, carry):
+            state, draws = carry
+            state = self.sampler.sample(state, self.args, self.kwargs)
+
+            def is_kept(name):
+                return self.count(name, i + 1) > self.count(name, i)
+
+            draw = jax.lax.cond(is_kept(""), lambda state: _named(self._collect(state)), lambda _: empty, state)
+            places = {k: jnp.where(is_kept(k), self.count(k, i) - self.count(k, begin), sizes[k]) for k in draw}
+            return state, {k: draws[k].at[places[k]].set(draw[k], mode="drop") for k in draw}
+
+        draws = {k: jnp.zeros((sizes[k], *x.shape), x.dtype) for k, x in empty.items()}
+        return jax.lax.fori_loop(begin, end, step, (state, draws))
+
+
+def _over_chains(mcmc, fn, jit=lambda fn: fn):
+    """`fn(x, common)`, x being of one chain, for all chains by the method of `mcmc`."""
+    method = mcmc.chain_method
+    if mcmc.num_chains == 1 or method == "vectorized":
+        return jit(fn)
+    if method == "parallel":
+        return jax.pmap(fn, in_axes=(0, None))
+    if not isinstance(method, str):
+        return jit(lambda x, common: method(lambda x: fn(x, common))(x))
+    one, stack = jit(fn), partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
+    return lambda x, common: stack(*[one(_chain(x, c), common) for c in range(mcmc.num_chains)])
+
+
+def _chain(x, c):
+    return jax.tree.map(lambda leaf: leaf[c], x)
+
+
+def _noise_of(sampler, args, kwargs) -> tuple[str, ...]:
+    if not callable(model := getattr(sampler, "model", None)):
+        return ()
+    model = numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), substitute_fn=init_to_sample)
+    return noise_sites(numpyro.handlers.trace(model).get_trace(*args, **kwargs))
+
+
+def _array(x):
+    return x if hasattr(x, "dtype") else jnp.asarray(x)
+
+
+def _is_key(x) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _plain(tree):
+    """Typed keys as their data."""
+    return jax.tree.map(lambda x: jr.key_data(x) if _is_key(x) else x, tree)
+
+
+def _named(tree) -> dict:
+    """Leaves by their paths."""
+    return {keystr(path, simple=True, separator="/"): leaf for path, leaf in tree_flatten_with_path(tree)[0]}
+
+
+def _rebuilt(arrays, like):
+    """A tree from its named leaves on the host, with the keys and dtypes of another."""
+
+    def leaf(x, new):
+        return jr.wrap_key_data(new, impl=jr.key_impl(x)) if _is_key(x) else new.view(x.dtype)
+
+    leaves = [leaf(x, np.asarray(arrays[name])) for name, x in _named(like).items()]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+def _settings_of(kernel, name) -> dict:
+    """The numbers and switches of a kernel, and of its blocks."""
+    numbers = {k: v for k, v in vars(kernel).items() if isinstance(v, bool | int | float | str)}
+    settings = {name: type(kernel).__name__} | {f"{name}.{k.lstrip('_')}": v for k, v in numbers.items()}
+    for i, block in enumerate(getattr(kernel, "_kernels", ())):
+        settings |= _settings_of(block, f"{name}.blocks.{i}")
+    return settings
+
+
+def _described(x) -> str:
+    """A value that a file can hold: short ones in full, others by a hash; of what is no array, the type."""
+    if not hasattr(x, "dtype"):
+        return repr(x) if isinstance(x, bool | int | float | complex | str) else type(x).__qualname__
+    data = np.asarray(jr.key_data(x) if _is_key(x) else x)
+    value = data.tolist() if data.size <= 8 else f"with SHA-256 {hashlib.sha256(data.tobytes()).hexdigest()[:12]}"
+    return f"{x.dtype}{list(x.shape)} {value}"
+
+
+def _draws_file(folder, begin):
+    return folder / f"draws_{begin:09}.npz"
+
+
+def _write(file, arrays) -> None:
+    """All of a file or nothing, also on a disk that loses its power."""
+    with open(file.with_suffix(".tmp"), "wb") as f:
+        np.savez(f, **arrays)
+        f.flush()
+        os.fsync(f.fileno())
+    os.replace(file.with_suffix(".tmp"), file)
+    if os.name == "posix":
+        directory = os.open(file.parent, os.O_RDONLY)
+        os.fsync(directory)
+        os.close(directory)
+
+
+def _read(file) -> dict:
+    try:
+        with open(file, "rb") as f, np.load(f, allow_pickle=False) as arrays:
+            return dict(arrays)
+    except (BadZipFile, EOFError, TypeError, ValueError) as e:
+        raise ValueError(f"`path` holds a {file.name} that cannot be read, {file}. Choose another path.") from e
+
+
+def _load_state(folder, chains):
+    """The last state that was committed, and its iteration; the start, if there is none."""
+    file = folder / "state.npz"
+    if not file.exists():
+        return chains.start, 0
+    stored = _read(file)
+    require({"iterations", "settings", "start"} <= set(stored), f"{file} is of another program. Choose another `path`.")
+    old, new = json.loads(str(stored["settings"])), chains.settings
+    for name in dict.fromkeys([*new, *old]):
+        require(
+            old.get(name) == new.get(name),
+            f"`path` {folder} holds a run with another {name}: {old.get(name)} there, {new.get(name)} in this call. "
+            "Choose another path, or go back to the old setting.",
+        )
+    if not np.allclose(stored["start"], chains.fingerprint, rtol=1e-5):
+        warnings.warn(
+            f"the chains of `path` {folder} started elsewhere than this call would start them: the model, data that it "
+            "takes from outside its arguments, or a version has changed. If it is the model, choose another path.",
+            stacklevel=3,
+        )
+    state = {name.removeprefix("state/"): x for name, x in stored.items() if name.startswith("state/")}
+    return _rebuilt(state, chains.start), int(stored["iterations"])
+
+
+def _load_draws(folder, chains, done) -> dict:
+    """The draws of the intervals before `done`, by name; none before the end of the warm-up."""
+    if not (expected := chains.count("", done)):
+        return {}
+    files = [file for file in sorted(folder.glob("draws_*.npz")) if int(file.stem.removeprefix("draws_")) < done]
+    parts = [_read(file) for file in files]
+    draws = {name: np.concatenate([part[name] for part in parts], 1) for name in _named(chains.draw)} if parts else {}
+    found = next(iter(draws.values())).shape[1] if draws else 0
+    require(found == expected, f"`path` {folder} lacks draws: {found} of {expected} are there. Choose another path.")
+    return draws
+
+
+def _hand_over(folder, chains, state, done) -> None:
+    """Leaves `mcmc` as after `run`."""
+    draws, mcmc = _load_draws(folder, chains, done), chains.mcmc
+    mcmc._args, mcmc._kwargs = chains.args, chains.kwargs
+    mcmc._last_state = jax.tree.map(jnp.asarray, state)
+    mcmc._states = jax.tree.map(jnp.asarray, _rebuilt(draws, chains.draw)) if draws else None
+    mcmc._states_flat = None

@@ -1,0 +1,72 @@
+"""What kernels report of their draws, and ArviZ's names of it."""
+
+from typing import Any
+
+import numpy as np
+from numpyro.infer import HMC, NUTS, Gibbs
+
+from ._hmc import FunctionSpaceHMC
+from ._pcn import AbstractPCN
+from ._pseudo_marginal import AbstractPseudoMarginal
+
+_HMC_FIELDS = ("potential_energy", "energy", "accept_prob", "num_steps", "adapt_state.step_size", "diverging")
+
+_FIELDS = {
+    HMC: _HMC_FIELDS,
+    FunctionSpaceHMC: _HMC_FIELDS,
+    AbstractPCN: ("potential_energy", "accept_prob", "diverging"),
+    AbstractPseudoMarginal: ("potential_energy", "accept_prob", "step_size", "diverging"),
+}
+
+_ARVIZ_NAMES = {
+    "potential_energy": "lp",
+    "accept_prob": "acceptance_rate",
+    "num_steps": "n_steps",
+    "adapt_state.step_size": "step_size",
+}
+
+
+def fields(kernel) -> tuple[str, ...]:
+    """What a kernel can report of each draw: `mcmc.run(key, data, extra_fields=nb.infer.fields(kernel))`.
+
+    **Arguments:** `kernel`: NUTS, HMC, a kernel of this package, or `Gibbs`, which reports what its blocks do.
+
+    **Returns:** names of fields of the kernel's state; of any other kernel, those that NumPyro collects by default.
+    """
+    return tuple(path + name for block, path, _ in _blocks(kernel) for name in _fields_of(block))
+
+
+def statistics(fields: dict[str, Any], kernel) -> dict[str, Any]:
+    """Arrays under ArviZ's names; those of a block of `Gibbs` with its prefix."""
+    found = {name: value for name, value in fields.items() if hasattr(value, "shape")}
+    for block, path, prefix in _blocks(kernel):
+        own = {name.removeprefix(path): found.pop(name) for name in list(found) if name.startswith(path)}
+        own = {_ARVIZ_NAMES.get(name, name): value for name, value in own.items()}
+        if "lp" in own:
+            own["lp"] = -own["lp"]
+        if "n_steps" in own and isinstance(block, NUTS):
+            own["tree_depth"] = np.log2(np.asarray(own["n_steps"])).astype(int) + 1
+        found |= {prefix + name: value for name, value in own.items()}
+    diverging = [np.asarray(value) for name, value in found.items() if name.endswith("_diverging")]
+    if diverging and "diverging" not in found:
+        found["diverging"] = np.any(diverging, axis=0)
+    return found
+
+
+def _fields_of(kernel) -> tuple[str, ...]:
+    known = [names for kind, names in _FIELDS.items() if isinstance(kernel, kind)]
+    return known[0] if known else tuple(name for name in kernel.default_fields if name != kernel.sample_field)
+
+
+def _blocks(kernel, path="", prefix="") -> list[tuple[Any, str, str]]:
+    """The kernels that make a draw, each with the path of its state and the prefix of its statistics."""
+    if not isinstance(kernel, Gibbs):
+        return [(kernel, path, prefix)]
+    kernels = [block for block, _ in kernel.blocks]
+    names = [type(block).__name__.lower() for block in kernels]
+    names = [f"{name}{i}" if names.count(name) > 1 else name for i, name in enumerate(names)]
+    return [
+        leaf
+        for i, (block, name) in enumerate(zip(kernels, names, strict=True))
+        for leaf in _blocks(block, f"{path}block_states.{i}.", f"{prefix}{name}_")
+    ]
