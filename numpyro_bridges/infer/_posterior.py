@@ -38,6 +38,13 @@ def noise_sites(trace) -> tuple[str, ...]:
     return tuple(name for name, site in trace.items() if is_noise(site) and not site["is_observed"])
 
 
+class _Nothing(dist.ImproperUniform):
+    """Has log density 0, and does not look at the value."""
+
+    def log_prob(self, value):
+        return jnp.zeros(self.batch_shape)
+
+
 class _Split(Messenger):
     """Takes the prior of the noise, and the likelihoods that it drives, out of a model; keeps the latter."""
 
@@ -48,13 +55,12 @@ class _Split(Messenger):
     def process_message(self, msg):
         if msg["type"] != "sample":
             return
-        fn = msg["fn"]
-        if is_noise(msg):
-            msg["fn"] = dist.ImproperUniform(constraints.real, fn.batch_shape, fn.event_shape)
-        elif msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
+        fn, log_prob = msg["fn"], None
+        if msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
             log_prob = fn.log_prob(msg["value"])
             self.log_likelihood[msg["name"]] = log_prob if msg["scale"] is None else msg["scale"] * log_prob
-            msg["fn"] = fn.mask(jnp.array(False))
+        if is_noise(msg) or log_prob is not None:
+            msg["fn"] = _Nothing(constraints.real, fn.batch_shape, fn.event_shape)
 
 
 def split(model, model_args, model_kwargs, z: Sites) -> tuple[Array, Sites]:
