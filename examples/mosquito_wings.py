@@ -59,12 +59,12 @@ print(f"observation SD 0.005, ratio {0.005 / spread:.2f}")
 
 
 # %%
-def model(observed=None, num_specimens=len(points)):
+def model(observed=None, num_specimens=None):
     amplitude = numpyro.sample("amplitude", dist.LogNormal(-2.0, 1.0))
     length_scale = numpyro.sample("length_scale", dist.LogNormal(-1.0, 0.5))
     flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale))
     law = nb.DiffusionEndpoint(flow, wings.mean, seen, t1=1.0, num_steps=num_steps)
-    with numpyro.plate("specimen", num_specimens):
+    with numpyro.plate("specimen", num_specimens or len(points)):
         nb.sample("wing", law, obs=observed)
 
 

@@ -1,5 +1,6 @@
 """The README's first page and the examples run as they stand."""
 
+import json
 import os
 import re
 import subprocess
@@ -50,6 +51,22 @@ def test_mosquito_wings(tmp_path):
     assert "r_hat" in out and "divergences: 0" in out
     for name in ("wings.nc", "bridges.png", "posterior.png", "score.png"):
         assert (tmp_path / "output" / name).stat().st_size > 5000
+
+
+def test_calibration(tmp_path):
+    """A small version: 64 replicates of one model and kernel."""
+    pytest.importorskip("matplotlib")
+    chosen = "--quick --models sine --kernels FunctionSpaceHMC --output output".split()
+    out = run(str(ROOT / "benchmarks/calibration.py"), *chosen, cwd=tmp_path)
+    (row,) = [json.loads(line) for line in out.splitlines()]
+    assert len(row["largest_over_band"]) == 4 and row["inside"], row
+    assert (tmp_path / "output" / "calibration.png").stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_mcmc_benchmark(tmp_path):
+    out = run(str(ROOT / "benchmarks/mcmc.py"), "--quick", cwd=tmp_path)
+    assert [json.loads(line)["kernel"] for line in out.splitlines()] == ["gibbs-pcn-nuts", "function-space-hmc"]
 
 
 @pytest.mark.slow
