@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import time
+import zlib
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -101,7 +102,8 @@ def ranks(name, kernel, model, num_replicates, num_warmup, num_draws, thin, seed
         _, draws = jax.lax.scan(kept, state, length=num_draws // thin)
         return {k: jnp.sum(draws[k] < truth[k]) for k in truth}
 
-    batches = jr.split(jr.key(seed), num_replicates).reshape(-1, min(num_replicates, 64))
+    key = jr.key(seed + zlib.crc32(name.encode()))  # each kernel meets truths of its own
+    batches = jr.split(key, num_replicates).reshape(-1, min(num_replicates, 64))
     found = [jax.device_get(jax.jit(jax.vmap(replicate))(keys)) for keys in batches]
     return {k: np.concatenate([batch[k] for batch in found]) for k in found[0]}
 
