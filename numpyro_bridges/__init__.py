@@ -1,6 +1,6 @@
 """Conditioned stochastic differential equations on function spaces as NumPyro likelihoods."""
 
-from . import datasets as datasets, infer as infer, io as io, plot as plot
+from . import datasets as datasets, infer as infer, io as io, plot as plot, scores as scores
 from .bridges import GuidedBridge as GuidedBridge
 from .conditioning import (
     AbstractCondition as AbstractCondition,

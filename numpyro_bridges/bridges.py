@@ -13,14 +13,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ._checks import as_float, concrete, require, require_finite, require_instance
 from ._linalg import apply, congruence, full_precision, promote
 from ._types import RealScalar, State
-from .conditioning import AbstractCondition, Target
+from .conditioning import AbstractCondition, Observation, Target
 from .guiding import (
     AbstractGuide,
-    FrozenGuide,
     GridNoise,
     GuidedStep,
-    RecedingGuide,
     arrive,
+    default_guide,
     exact_message,
     levy_area,
     retrace,
@@ -109,7 +108,7 @@ class GuidedBridge(eqx.Module):
         sde.check_state(x0)
         condition.check(sde, x0)
         if guide is None:
-            guide = FrozenGuide() if sde.has_constant_covariance(x0) else RecedingGuide()
+            guide = default_guide(sde, x0)
         require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         guide.check(sde, x0)
         self.sde, self.condition, self.x0, self.guide = sde, condition, x0, guide
@@ -131,7 +130,7 @@ class GuidedBridge(eqx.Module):
             f"`solver` must be a diffrax solver for SDEs, such as `diffrax.Euler()`; got {self.solver!r}.",
         )
         if not self._is_discrete:
-            seen, reference = self._end()
+            seen, reference = self.end()
             auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
             if self.condition.exact:
                 a = congruence(seen.operator, self.sde.covariance(self.ts[-1], reference))
@@ -146,7 +145,7 @@ class GuidedBridge(eqx.Module):
                 )
 
     def _check_exact(self):
-        seen, _ = self._end()
+        seen, _ = self.end()
         dt = self.ts[-1] - self.ts[-2]
         S = congruence(seen.operator, self.sde.transition(self.ts[0], self.ts[0] + dt, self.x0).covariance)
         if concrete(S) is not None:
@@ -210,8 +209,8 @@ class GuidedBridge(eqx.Module):
         extra = self.condition.num_extra_noises
         return noise[:extra], noise[extra:]
 
-    def _end(self):
-        """What is seen, and a state that meets it."""
+    def end(self) -> tuple[Observation, State]:
+        """What is seen of the end state, and a state that meets the condition."""
         seen = self.condition.observation(self.sde, self.x0)
         free = self.x0
 
@@ -223,10 +222,15 @@ class GuidedBridge(eqx.Module):
         reference = self.condition.reference(self.sde, free)
         return seen, reference
 
+    def observed(self) -> State:
+        """The value that is observed; `ValueError` for a set."""
+        require(self.condition.num_extra_noises == 0, "`condition` is a set, which has no observed value.")
+        return self._target(jnp.zeros((0,))).value
+
     @full_precision
     def _message(self, t, x: State, observed: State):
         """The guide's forecast of what is seen from x at the grid time at or below t."""
-        seen, reference = self._end()
+        seen, reference = self.end()
         if not self._is_discrete:
             auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
             return exact_message(auxiliary, seen, t, self.ts[-1], x, observed)
@@ -259,19 +263,31 @@ class GuidedBridge(eqx.Module):
         return self.condition.log_value(apply(message.operator, x) + message.shift, message.factor) + seen.log_scale
 
     def score(self, t: RealScalar, x: State) -> State:
-        """∇ log h̃(t, x), the guide's covariance held fixed: where the path is pulled, before a(x) acts on it."""
+        """∇ log h̃(t, x), the guide's covariance held fixed: where the path is pulled, before a(x) acts on it.
+
+        A learned guide's network is in it.
+        """
         x = self._before_the_end(t, x)
         seen = self.condition.observation(self.sde, x)
         message = self._message(t, x, jnp.zeros_like(apply(seen.operator, x)))
-        return jax.grad(lambda y: self.condition.log_value(apply(message.operator, y) + message.shift, message.factor))(
-            x
-        )
+
+        def log_h(y):
+            return self.condition.log_value(apply(message.operator, y) + message.shift, message.factor)
+
+        return jax.grad(log_h)(x) + self._correction(t, x)
+
+    def _correction(self, t, x: State) -> State:
+        if not self._is_discrete:
+            return jnp.zeros_like(x)
+        plan = self.guide.plan(self.sde, *self.end(), self.ts)
+        k = GridNoise(ts=self.ts, noise=self.x0).index(t)
+        return plan.correction(jax.tree.map(lambda a: a[k], plan.steps), x)
 
     @eqx.filter_jit
     @full_precision
     def _run(self, noise):
         extra, noise = self._split(noise)
-        seen, reference = self._end()
+        seen, reference = self.end()
         target = self._target(extra)
         v = target.value
         if not self._is_discrete:
@@ -298,12 +314,12 @@ class GuidedBridge(eqx.Module):
         path = as_float(path, "path").astype(self.x0.dtype)
         shape = (self.num_steps + 1, *self.x0.shape)
         require(path.shape == shape, f"`path` must have shape {shape}; got {path.shape}.")
-        seen, reference = self._end()
+        seen, reference = self.end()
         plan = self.guide.plan(self.sde, seen, reference, self.ts)
         if seen.exact:
             observed = apply(seen.operator, path[-1])
         else:
-            observed = self._target(jnp.zeros((0,))).value
+            observed = self.observed()
         z = retrace(self.sde, plan, seen, self.ts, path, observed, key)
         if self.condition.num_extra_noises:
             message = self._message(self.ts[0], self.x0, jnp.zeros_like(observed))

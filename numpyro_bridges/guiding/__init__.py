@@ -14,6 +14,14 @@ from ._guides import (
     FrozenGuide as FrozenGuide,
     RecedingGuide as RecedingGuide,
     backward_filter as backward_filter,
+    default_guide as default_guide,
+)
+from ._score import (
+    LearnedSteering as LearnedSteering,
+    ScoreGuide as ScoreGuide,
+    ScorePlan as ScorePlan,
+    Standard as Standard,
+    Unguided as Unguided,
 )
 from ._steering import (
     AbstractSteering as AbstractSteering,

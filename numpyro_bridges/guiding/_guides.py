@@ -41,6 +41,10 @@ class AbstractPlan(eqx.Module):
     def message(self, step: Any, sde: AbstractSDE, t: RealScalar, x: State, observed: State) -> GaussianMessage:
         """h̃(t, ·) as the guide sees it at x, `step` being the entry of `steps` at time t."""
 
+    def correction(self, step: Any, x: State) -> State:
+        """What the guide adds to the score of its message: a learned guide's network."""
+        return jnp.zeros_like(x)
+
 
 class AbstractGuide(eqx.Module):
     """A way to lead paths to what is observed."""
@@ -213,6 +217,14 @@ class _DriftPlan(AbstractPlan):
 
     def message(self, step, sde, t, x, observed):
         return self.wrapped.message(step, sde, t, x, observed)
+
+    def correction(self, step, x):
+        return self.wrapped.correction(step, x)
+
+
+def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:
+    """`RecedingGuide()` where a depends on the state, `FrozenGuide()` where it is constant."""
+    return FrozenGuide() if sde.has_constant_covariance(x) else RecedingGuide()
 
 
 def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, State, Structured]:

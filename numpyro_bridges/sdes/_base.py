@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from .._checks import floating, require
-from .._linalg import add, apply, columns, full_precision
+from .._linalg import add, apply, columns, full_precision, promote
 from .._types import Noise, RealScalar, State, Structured
 from ..spaces import AbstractSpace
 
@@ -77,6 +77,13 @@ class AbstractSDE(eqx.Module):
     def covariance(self, t: RealScalar, x: State) -> Structured:
         """a(t, x) = σσᵀ: `()`, `(n,)` or `(n, n)`."""
         return self.noise(t, x)[1]
+
+    def covariance_divergence(self, t: RealScalar, x: State) -> State:
+        """(div a)_i = Σ_j ∂a_ij/∂x_j, shaped like x."""
+        if self.has_constant_covariance(x):
+            return jnp.zeros_like(x)
+        jacobian = jax.jacfwd(lambda y: promote(self.covariance(t, y), 2, x.shape[0]))(x)
+        return jnp.einsum("ijj...->i...", jacobian)
 
     def noise_size(self, x: State) -> int:
         """Number k of driving noises per column."""

@@ -81,6 +81,12 @@ class KunitaFlow(AbstractSDE):
         sigma = self.space.from_points(sigma)
         return sigma, sigma @ sigma.T
 
+    def covariance_divergence(self, t: RealScalar, x: State) -> State:
+        if not isinstance(self.space, Landmarks):
+            return super().covariance_divergence(t, x)
+        slope = jax.grad(self.covariance_kernel, argnums=1)
+        return jnp.sum(jax.vmap(lambda p: jax.vmap(lambda q: slope(p, q))(x))(x), axis=1)
+
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         return jnp.zeros((), x.dtype), jnp.zeros_like(x)
 

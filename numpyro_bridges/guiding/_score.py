@@ -1,0 +1,178 @@
+"""A learned guide: a network on top of another guide.
+
+With h̃ the guide's and h the true function, the network is to be
+
+    s(t, x) = ∇log h(t, x) − ∇log h̃(t, x),
+
+what the guide lacks; the part of ∇log h that is singular near the end is the guide's. In a step z ~ N(0, I) becomes
+z + √dt σᵀ s before it is guided, and the log weight gains log N(z + √dt σᵀ s; 0, I) − log N(z; 0, I): exact whatever
+the network says (Yang, van der Meulen and Sommer 2025).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._checks import require, require_instance
+from .._linalg import apply, transpose
+from .._types import Noise, State, Structured
+from ..conditioning import GaussianMessage
+from ..spaces import Landmarks
+from ._guides import AbstractGuide, AbstractPlan
+from ._steering import AbstractSteering, DriftSteering, log_ratio
+
+Context = Callable[[Any], Array]
+
+
+class LearnedSteering(AbstractSteering):
+    """z + shift, steered by `base`. `held` equals `shift`: it is what enters the density (see `ScoreGuide.held`)."""
+
+    base: AbstractSteering
+    shift: Noise
+    held: Noise
+
+    def mean(self):
+        return self.base.drive(self.shift)[0]
+
+    def drive(self, z):
+        moved = z + self.shift
+        u, log_weight = self.base.drive(moved)
+        return u, log_weight + log_ratio(z + (self.shift - self.held), moved)
+
+    def inverse(self, u):
+        return self.base.inverse(u) - self.shift
+
+
+class Standard(eqx.Module):
+    """How what a network sees is standardised: x̂ = (x − v)/scale, v̂ = (v − centre)/spread, and θ̂ alike.
+
+    `scale` and `spread` are `(n, dim)`, or numbers for `Landmarks`, where v̂ is centred at its own mean instead: the
+    network then sees neither a translation nor the number of points. `duration` is that of the training.
+    """
+
+    duration: Float[Array, ""]
+    scale: Array
+    centre: Array
+    spread: Array
+    context_mean: Float[Array, " c"]
+    context_scale: Float[Array, " c"]
+
+    def target(self, v: State, pooled: bool) -> Float[Array, "n dim"]:
+        """v̂."""
+        centre = jnp.mean(v, axis=0) if pooled else self.centre
+        return (v - centre) / self.spread
+
+
+class ScoreGuide(AbstractGuide):
+    """Another guide, corrected by a network. `numpyro_bridges.scores.fit` trains one.
+
+    **Arguments:**
+
+    - `guide`: the guide that is corrected; `Unguided()` to learn all of ∇log h.
+    - `network`: an `equinox.Module` or function `network(t, x, v, theta)`, shaped like x `(n, dim)`: `t` from 0 to 1,
+      `x` the displacement from the target and `v` the target, standardised, `theta` `(c,)` the standardised context,
+      of size 0 if there is none. Its output in units of 1/√(T ā), ā the mean of the diagonal of a at the target,
+      times the weights of the space, is s.
+    - `standard`: how its input is standardised.
+    - `context`: `context(sde)`, the parameters that the network sees, `(c,)`; `None` if it was trained for one SDE.
+    - `history`: of the training: `step`, `loss`, `bound` (E log w held out), `ess` (of it, a fraction), `seconds`.
+    - `held`: a copy of the network with its gradient stopped, in training: the gradient of log w by the network is then
+      by the path alone (Roeder, Wu and Duvenaud 2017), which has no noise where the guide is perfect.
+    """
+
+    guide: AbstractGuide
+    network: Callable
+    standard: Standard
+    context: Context | None = eqx.field(static=True, default=None)
+    history: dict[str, Array] = eqx.field(default_factory=dict)
+    held: Callable | None = None
+
+    def __check_init__(self):
+        require_instance(self.guide, AbstractGuide, "guide", "a guide, such as `RecedingGuide()`")
+        require(callable(self.network), f"`network` must be a function (t, x, v, theta); got {self.network!r}.")
+
+    def check(self, sde, x):
+        self.guide.check(sde, x)
+        scale, shape = self.standard.scale.shape, x.shape if x.ndim == 2 else (*x.shape, 1)
+        require(
+            scale in ((), shape),
+            f"`guide` was trained for states {scale}; got a state {x.shape}. Only landmarks may change their number.",
+        )
+
+    def plan(self, sde, seen, reference, ts):
+        base = self.guide.plan(sde, seen, reference, ts)
+        n, dtype = reference.shape[0], reference.dtype
+        weights = jnp.ones(n, dtype) if sde.space is None else sde.space.weights.astype(dtype)
+        a = jnp.broadcast_to(_diagonal(sde.covariance(ts[-1], reference)), (n,))
+        unit = weights * jnp.sqrt(jnp.sum(weights) / jnp.sum(weights * a) / self.standard.duration)
+        pooled = isinstance(sde.space, Landmarks)
+        theta = jnp.zeros(0, dtype)
+        if self.context is not None:
+            theta = (self.context(sde) - self.standard.context_mean) / self.standard.context_scale
+        v = reference.reshape(n, -1)
+        inputs = v, self.standard.target(v, pooled), theta
+        return ScorePlan((base.steps, ts[-1] - ts[:-1]), base, self.network, self.held, self.standard, unit, inputs)
+
+
+class ScorePlan(AbstractPlan):
+    """The base guide's plan, and what the network needs."""
+
+    steps: tuple[Any, Float[Array, " K"]]
+    base: AbstractPlan
+    network: Callable
+    held: Callable | None
+    standard: Standard
+    unit: Float[Array, " n"]
+    fixed: tuple[Array, Array, Array]
+
+    def inputs(self, left, x: State) -> tuple[Array, Array, Array, Array]:
+        """What the network sees at x, a time `left` before the end."""
+        v, target, theta = self.fixed
+        x = (x.reshape(v.shape) - v) / self.standard.scale
+        return 1 - left / self.standard.duration, x, target, theta
+
+    def score(self, output, x: State) -> State:
+        """s from the network's output."""
+        return (self.unit[:, None] * output).reshape(x.shape)
+
+    def steer(self, step, transition, dt, x, observed):
+        planned, left = step
+        inputs = self.inputs(left + dt, x)
+        factor = transpose(transition.factor)
+        shift = apply(factor, self.score(self.network(*inputs), x))
+        held = shift if self.held is None else apply(factor, self.score(self.held(*inputs), x))
+        return LearnedSteering(self.base.steer(planned, transition, dt, x, observed), shift, held)
+
+    def message(self, step, sde, t, x, observed):
+        return self.base.message(step[0], sde, t, x, observed)
+
+    def correction(self, step, x):
+        return self.base.correction(step[0], x) + self.score(self.network(*self.inputs(step[1], x)), x)
+
+
+class Unguided(AbstractGuide):
+    """No guide, h̃ = 1: paths of the SDE itself, weighted by the density of what is seen."""
+
+    def plan(self, sde, seen, reference, ts):
+        return _UnguidedPlan(ts[:-1], 0 * seen.operator)
+
+
+class _UnguidedPlan(AbstractPlan):
+    steps: Float[Array, " K"]
+    operator: Structured
+
+    def steer(self, step, transition, dt, x, observed):
+        zero = jax.eval_shape(lambda: apply(transpose(transition.factor), x))
+        return DriftSteering(jnp.zeros(zero.shape, zero.dtype))
+
+    def message(self, step, sde, t, x, observed):
+        one = jnp.ones((), x.dtype)
+        return GaussianMessage(self.operator, jnp.zeros_like(observed), one, observed, 0 * one)
+
+
+def _diagonal(a):
+    return jnp.diagonal(a) if a.ndim == 2 else a

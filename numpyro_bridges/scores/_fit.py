@@ -1,0 +1,343 @@
+"""Training of learned guides: what is the same for every method, and the three methods.
+
+- `residual`: the evidence bound E log w is maximised (Yang, van der Meulen and Sommer 2025).
+- `adjoint`: score matching on the weighted reversed process from the observation (Baker, Schauer and Sommer 2024).
+- `reversal`: score matching of the unconditioned process gives the time reversal; score matching on its paths gives the
+  bridge (Heng, De Bortoli, Doucet and Thornton 2021), twice reversed.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+from jaxtyping import Array, PRNGKeyArray
+
+from .. import weights
+from .._checks import concrete, require, require_instance
+from .._linalg import full_precision
+from .._types import RealScalar, State
+from ..bridges import GuidedBridge
+from ..conditioning import AbstractCondition
+from ..guiding import AbstractGuide, FrozenGuide, ScoreGuide, Standard, Unguided, default_guide
+from ..sdes import AbstractSDE, BrownianMotion
+from ..spaces import Landmarks
+from ._clouds import Cloud, adjoint_cloud, forward_cloud, reversal_cloud, reversed_bridge, whiten
+from ._networks import MLP, PointNetwork, over_batch
+from ._training import Training, train
+
+Draw = Callable[[PRNGKeyArray], tuple[AbstractSDE, AbstractCondition, State]]
+
+
+class Problem(NamedTuple):
+    """Bridges `draw(key)` that one network is to guide, and how it is trained."""
+
+    draw: Callable[[PRNGKeyArray], GuidedBridge]
+    amortised: bool
+    guide: ScoreGuide
+    training: Training
+    train: Callable
+
+
+@full_precision
+def fit(
+    sde: AbstractSDE,
+    condition: AbstractCondition,
+    *,
+    x0: State,
+    t1: RealScalar | None = None,
+    key: PRNGKeyArray,
+    method: str = "residual",
+    t0: RealScalar = 0.0,
+    num_steps: int | None = None,
+    ts=None,
+    guide: AbstractGuide | None = None,
+    network: Callable | None = None,
+    training: Training | None = None,
+    draw: Draw | None = None,
+    context: Callable[[Any], Array] | None = None,
+    directory: str | Path | None = None,
+    progress: bool = True,
+) -> ScoreGuide:
+    """Trains a network that corrects a guide, so that guide and network together are ∇log h.
+
+        score = scores.fit(sde, condition, x0=x0, t1=1.0, key=key)
+        bridge.with_guide(score)
+
+    Its weights are exact whatever was learned, and what is returned is the best network met on held-out paths, the
+    guide as it is included: training does not spoil a guide.
+
+    **Arguments:**
+
+    - `sde`, `condition`, `x0`, `t1`, `t0`, `num_steps` (100 by default), `ts`, `guide`: as for `GuidedBridge`.
+      `guide=Unguided()` learns all of ∇log h from nothing.
+    - `method`: `"residual"` (any SDE and condition), `"adjoint"` (an observation of the whole state) or `"reversal"`
+      (an observed value); the latter two need noise in every direction.
+    - `network`: `network(t, x, v, theta)`, see `ScoreGuide`; by default a `PointNetwork` for landmarks, an `MLP` else.
+    - `training`: a `Training`.
+    - `draw`: `draw(key)` gives `(sde, condition, x0)` like those given, for a guide that serves many of them: other
+      parameters, targets or starts. `context(sde)`, `(c,)`, are the parameters that the network is told; it is always
+      told the target.
+    - `directory`: where training is saved at each look; the same call resumes from there.
+    - `progress`: show a bar with the loss, the evidence bound and the ESS on held-out paths.
+
+    **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
+    training with a warning.
+    """
+    require(
+        method in METHODS, f"`method` must be one of {sorted(METHODS)}; got {method!r}. 'residual' suits every bridge."
+    )
+    if ts is None and num_steps is None:
+        num_steps = 100
+    bridge = GuidedBridge(sde, condition, x0=x0, t1=t1, t0=t0, num_steps=num_steps, ts=ts, guide=guide)
+    training = Training() if training is None else training
+    require_instance(training, Training, "training", "a `Training(...)`")
+    require(context is None or callable(context), f"`context` must be a function of the SDE; got {context!r}.")
+    key_network, key_pilot, key_train = jr.split(key, 3)
+
+    def draw_bridge(key):
+        if draw is None:
+            return bridge
+        sde, condition, x0 = draw(key)
+        return GuidedBridge(sde, condition, x0=x0, ts=bridge.ts, guide=bridge.guide)
+
+    if network is None:
+        size = 0 if context is None else context(sde).shape[0]
+        n, dim = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
+        if isinstance(sde.space, Landmarks):
+            network = PointNetwork(dim, size, key=key_network)
+        else:
+            network = MLP((n, dim), size, key=key_network)
+    problem = Problem(
+        draw_bridge,
+        draw is not None,
+        _untrained(network, draw_bridge, context, key_pilot),
+        training,
+        partial(_train, directory=None if directory is None else Path(directory), progress=progress),
+    )
+    return METHODS[method](problem, key_train)
+
+
+def residual(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
+    """Maximises E log w."""
+    key_judge, key = jr.split(key)
+
+    def loss(network, key):
+        def one(key):
+            key_draw, key_noise = jr.split(key)
+            bridge = problem.draw(key_draw)
+            held = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, network)
+            guide = _with_network(problem.guide, network, held)
+            noise = jr.normal(key_noise, bridge.noise_shape, bridge.x0.dtype)
+            return -bridge.with_guide(guide).log_weight(noise)
+
+        return jnp.mean(jax.vmap(one)(jr.split(key, problem.training.batch_size))), network
+
+    return problem.train(problem, loss, _judge(problem, key_judge), key, "residual")
+
+
+def adjoint(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
+    """Score matching on the reversed process from the observation."""
+    bridge = problem.draw(key)
+    _need_noise(bridge, "adjoint")
+    seen, _ = bridge.end()
+    whole = bridge.condition.num_extra_noises == 0 and seen.operator.ndim == 0
+    whole = whole and (seen.factor is None or bool(jnp.all(jnp.isfinite(seen.factor))))
+    require(
+        whole,
+        "`method='adjoint'` starts at an observation of the whole state; this condition leaves a part of it free. "
+        "Use `method='residual'`.",
+    )
+    key_judge, key_pilot, key = jr.split(key, 3)
+    loss = _regression(problem, adjoint_cloud, key_pilot)
+    return problem.train(problem, loss, _judge(problem, key_judge), key, "adjoint")
+
+
+def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
+    """Score matching of the unconditioned process, and of its reversals from the observation."""
+    bridge = problem.draw(key)
+    _need_noise(bridge, "reversal")
+    require(
+        bridge.condition.num_extra_noises == 0,
+        "`method='reversal'` needs an observed value, and this condition is a set. Use `method='residual'`.",
+    )
+    key_standard, key_pilots, key_judges, key_first, key_second = jr.split(key, 5)
+    (key_pilot, key_pilot_2), (key_judge, key_judge_2) = jr.split(key_pilots), jr.split(key_judges)
+
+    def draw_back(key, guide):
+        key_draw, key_end = jr.split(key)
+        bridge = problem.draw(key_draw)
+        end = bridge.path(jr.normal(key_end, bridge.noise_shape, bridge.x0.dtype))[-1]
+        return reversed_bridge(bridge, end, guide(bridge))
+
+    context = problem.guide.context
+    back_context = None if context is None else lambda sde: context(sde.sde)
+
+    def backwards(guide):
+        draw = partial(draw_back, guide=guide)
+        back = problem._replace(draw=draw, guide=_untrained(problem.guide.network, draw, back_context, key_standard))
+        return back, _regression(back, forward_cloud, key_pilot)
+
+    unguided = isinstance(bridge.guide, Unguided)
+    candidates = [backwards(guide) for guide in ([lambda _: Unguided()] if unguided else [_linearised, _driftless])]
+    errors = [float(loss(problem.guide.network, key_judge)[0]) for _, loss in candidates]
+    back, loss = candidates[errors.index(min(errors))]
+
+    def judge(network):
+        value = -loss(network, key_judge)[0]
+        return value, value, jnp.full((), jnp.nan)
+
+    reverse = problem.train(back, loss, judge, key_first, "time reversal")
+
+    def cloud(bridge, key, size, rho=None):
+        return reversal_cloud(bridge, reverse, key, size, rho)
+
+    loss = _regression(problem, cloud, key_pilot_2)
+    found = problem.train(problem, loss, _judge(problem, key_judge_2), key_second, "reversal")
+    seconds = found.history["seconds"] + reverse.history["seconds"][-1]
+    return eqx.tree_at(lambda g: g.history["seconds"], found, seconds)
+
+
+def _linearised(bridge: GuidedBridge) -> AbstractGuide:
+    return default_guide(bridge.sde, bridge.x0)
+
+
+def _driftless(bridge: GuidedBridge) -> AbstractGuide:
+    """Better than the linearised one where the drift turns within the reach of the paths."""
+    return FrozenGuide(BrownianMotion(bridge.sde.covariance(bridge.ts[0], bridge.x0)))
+
+
+METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
+
+
+def _train(problem: Problem, loss, judge, key, name, *, directory, progress) -> ScoreGuide:
+    file = None if directory is None else directory / f"{name.replace(' ', '_')}.eqx"
+    network, history = train(
+        problem.guide.network, loss, judge, key, problem.training, name=name, file=file, progress=progress
+    )
+    guide = _with_network(problem.guide, network)
+    return ScoreGuide(guide.guide, network, guide.standard, guide.context, history)
+
+
+def _with_network(guide: ScoreGuide, network, held=None) -> ScoreGuide:
+    return ScoreGuide(guide.guide, network, guide.standard, guide.context, guide.history, held)
+
+
+def _regression(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray):
+    """The loss of score matching, ∫ E |s − (g − ∇log h̃)|²_a dt / T, on clouds; ρ is found first."""
+    size = problem.training.batch_size
+    draws = 4 if problem.amortised else 1
+
+    @jax.jit
+    def coefficient(key):
+        key_draw, key_cloud = jr.split(key)
+        return make(problem.draw(key_draw), key_cloud, 256).rho
+
+    rho = jnp.mean(jnp.stack([coefficient(k) for k in jr.split(key, draws)]), axis=0)
+    rho = jnp.zeros_like(rho) if problem.training.one_step else rho
+
+    def rows(network, key):
+        key_draw, key_cloud = jr.split(key)
+        bridge = problem.draw(key_draw)
+        cloud = make(bridge, key_cloud, -(-size // draws), rho)
+        seen, reference = bridge.end()
+        guide = _with_network(problem.guide, network)
+        plan = guide.plan(bridge.sde, seen, reference, bridge.ts)
+        observed = bridge.observed()
+
+        def lacking(step, t, x, g):
+            return g - plan.message(step, bridge.sde, t, x, observed).score(x)
+
+        each = jax.vmap(jax.vmap(lacking, (None, None, 0, 0)))
+        target = each(plan.steps, bridge.ts[:-1], cloud.x, cloud.score)
+        inputs = jax.vmap(jax.vmap(plan.inputs, (None, 0)))(plan.steps[1], cloud.x)
+
+        def error(output):
+            def one(t, x, f, target):
+                return jnp.sum(whiten(bridge, t, x, plan.score(f, x) - target) ** 2)
+
+            squares = jax.vmap(jax.vmap(one, (None, 0, 0, 0)))(bridge.ts[:-1], cloud.x, output, target)
+            dt = jnp.diff(bridge.ts)
+            return jnp.sum(dt[:, None] * cloud.weights * squares) / jnp.sum(dt)
+
+        return inputs, error
+
+    def loss(network, key):
+        if draws == 1:
+            inputs, error = rows(network, key)
+            flat = jax.tree.map(lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:]), inputs)
+            output, network = over_batch(network, flat)
+            return error(output.reshape(*inputs[0].shape, *output.shape[1:])), network
+
+        def one(key):
+            inputs, error = rows(network, key)
+            return error(jax.vmap(jax.vmap(network))(*inputs))
+
+        return jnp.mean(jax.vmap(one)(jr.split(key, draws))), network
+
+    return loss
+
+
+def _judge(problem: Problem, key: PRNGKeyArray):
+    """E log w, and the ESS fraction, on held-out paths."""
+    draws = 16 if problem.amortised else 1
+    size = -(-problem.training.held_out // draws)
+
+    def judge(network):
+        def one(key):
+            key_draw, key_noise = jr.split(key)
+            bridge = problem.draw(key_draw).with_guide(_with_network(problem.guide, network))
+            noise = jr.normal(key_noise, (size, *bridge.noise_shape), bridge.x0.dtype)
+            log_weights = jax.vmap(bridge.log_weight)(noise)
+            return jnp.mean(log_weights), weights.effective_sample_size(log_weights) / size
+
+        bound, ess = jax.tree.map(jnp.mean, jax.vmap(one)(jr.split(key, draws)))
+        value = jnp.where(jnp.isfinite(bound), bound, -jnp.inf)
+        return value, bound, ess
+
+    return judge
+
+
+def _untrained(network, draw, context, key, num_paths: int = 64) -> ScoreGuide:
+    """The guide with its network as it is, standardised on paths of the guide that it corrects."""
+
+    def one(key):
+        key_draw, key_noise = jr.split(key)
+        bridge = draw(key_draw)
+        path = bridge.path(jr.normal(key_noise, bridge.noise_shape, bridge.x0.dtype))
+        theta = jnp.zeros(0) if context is None else context(bridge.sde)
+        v = bridge.end()[1]
+        return path.reshape(*path.shape[:2], -1), v.reshape(v.shape[0], -1), theta
+
+    paths, v, theta = jax.jit(jax.vmap(one))(jr.split(key, num_paths))
+    bridge = draw(key)
+    duration = bridge.ts[-1] - bridge.ts[0]
+    pooled = isinstance(bridge.sde.space, Landmarks)
+    away = jnp.mean((paths - v[:, None]) ** 2, axis=(0, 1))
+    if pooled:
+        centre, spread = jnp.zeros(()), jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=1, keepdims=True)) ** 2))
+        away = jnp.mean(away)
+    else:
+        centre, spread = jnp.mean(v, axis=0), jnp.std(v, axis=0)
+        spread = jnp.where(spread > 1e-6 * (1 + jnp.abs(centre)), spread, 1.0)
+    scale = jnp.sqrt(away)
+    scale = jnp.where(scale > 1e-6 * jnp.max(scale), scale, 1.0)
+    deviation = jnp.std(theta, axis=0)
+    standard = Standard(
+        duration, scale, centre, spread, jnp.mean(theta, axis=0), jnp.where(deviation > 0, deviation, 1.0)
+    )
+    return ScoreGuide(bridge.guide, network, standard, context)
+
+
+def _need_noise(bridge: GuidedBridge, method: str) -> None:
+    a = bridge.sde.covariance(bridge.ts[0], bridge.x0)
+    if concrete(a) is not None:
+        pivots = jnp.diagonal(jnp.linalg.cholesky(a)) if a.ndim == 2 else jnp.atleast_1d(a)
+        require(
+            jnp.all(pivots > 0),
+            f"`method={method!r}` needs noise in every direction, and a(t0, x0) is singular. Use `method='residual'`.",
+        )

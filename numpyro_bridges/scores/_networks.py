@@ -1,0 +1,183 @@
+"""Networks `network(t, x, v, theta)`: `ScoreGuide` says what they are given. All but `UNet` start at zero."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+State2 = Float[Array, "n dim"]
+
+
+def time_features(t: Float[Array, ""], num: int) -> Float[Array, " 2*num"]:
+    """cos and sin of t at `num` frequencies from 1/2 to 8 turns, and none of the state's own scale."""
+    angles = 2 * jnp.pi * t * jnp.asarray(np.geomspace(0.5, 8.0, num), t.dtype)
+    return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)])
+
+
+class MLP(eqx.Module):
+    """A fully connected network on all coordinates; for states of a fixed size.
+
+    **Arguments:** `shape`: of the state, (n, dim). `context`: size of theta. `width`, `depth`: of the hidden layers.
+    """
+
+    layers: eqx.nn.MLP
+    num_times: int = eqx.field(static=True)
+
+    def __init__(self, shape: tuple[int, int], context: int = 0, *, key: PRNGKeyArray, width: int = 64, depth: int = 3):
+        self.num_times = 4
+        size = int(np.prod(shape))
+        layers = eqx.nn.MLP(2 * size + context + 8 + 2, size, width, depth, jax.nn.silu, key=key)
+        self.layers = eqx.tree_at(lambda m: m.layers[-1], layers, replace_fn=_zero)
+
+    def __call__(self, t, x: State2, v: State2, theta: Float[Array, " c"]) -> State2:
+        left = jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))])
+        features = [x.ravel(), v.ravel(), theta, left, time_features(t, self.num_times)]
+        return self.layers(jnp.concatenate(features).astype(x.dtype)).reshape(x.shape)
+
+
+class PointNetwork(eqx.Module):
+    """A network on a set of points, for any number of them: trained at 32 points, it can be used at 128.
+
+    Point i has features h_i; a layer adds to it an MLP of h_i and of averages over the other points,
+
+        (1/n) Σ_j exp(−|v_i − v_j|²/2 l²) V h_j,      a few learned widths l,
+
+    so that it commutes with relabelling, does not see translations, and has a limit as points fill a curve.
+
+    **Arguments:** `dim`: of the points. `context`: size of theta. `width`: of the features. `depth`: layers. `heads`:
+    widths l.
+    """
+
+    inner: eqx.nn.Linear
+    values: list[eqx.nn.Linear]
+    updates: list[eqx.nn.MLP]
+    log_widths: Float[Array, " heads"]
+    outer: eqx.nn.Linear
+
+    def __init__(
+        self, dim: int, context: int = 0, *, key: PRNGKeyArray, width: int = 32, depth: int = 2, heads: int = 4
+    ):
+        key_in, key_out, *keys = jr.split(key, 2 + 2 * depth)
+        self.inner = eqx.nn.Linear(2 * dim + context + 10, width, key=key_in)
+        self.values = [eqx.nn.Linear(width, width, key=k) for k in keys[:depth]]
+        self.updates = [eqx.nn.MLP((1 + heads) * width, width, 2 * width, 1, jax.nn.silu, key=k) for k in keys[depth:]]
+        self.log_widths = jnp.linspace(jnp.log(0.15), jnp.log(3.0), heads)
+        self.outer = _zero(eqx.nn.Linear(width, dim, key=key_out))
+
+    def __call__(self, t, x: State2, v: State2, theta: Float[Array, " c"]) -> State2:
+        n = x.shape[0]
+        square = jnp.sum((v[:, None] - v[None]) ** 2, -1)
+        near = jnp.exp(-0.5 * square * jnp.exp(-2 * self.log_widths.astype(x.dtype))[:, None, None]) / n
+        time = jnp.concatenate([jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))]), time_features(t, 4), theta])
+        shared = jnp.broadcast_to(time.astype(x.dtype), (n, time.shape[0]))
+        h = jax.vmap(self.inner)(jnp.concatenate([x, v, shared], axis=1))
+        for value, update in zip(self.values, self.updates, strict=True):
+            means = jnp.einsum("hij,jw->ihw", near, jax.vmap(value)(h)).reshape(n, -1)
+            h = h + jax.vmap(update)(jnp.concatenate([h, means], axis=1))
+        return jax.vmap(self.outer)(h)
+
+
+class UNet(eqx.Module):
+    """The fully connected U-net of Baker et al. (2024), appendix: time enters every level, batch normalisation.
+
+    Levels of two dense layers, down and up with skip connections, SiLU. Build it with `UNet.build(...)`, which returns
+    it `WithState`: batch normalisation keeps running means.
+
+    **Arguments:** `shape`: of the state. `widths`: of the levels on the way down, `(8N, 4N, 2N, N)` in the paper.
+    `embedding`: size of the time embedding.
+    """
+
+    inner: eqx.nn.Linear
+    time: eqx.nn.MLP
+    down: list["_Level"]
+    up: list["_Level"]
+    outer: eqx.nn.Linear
+    embedding: int = eqx.field(static=True)
+
+    def __init__(self, shape: tuple[int, int], widths: Sequence[int], embedding: int, *, key: PRNGKeyArray):
+        key_in, key_time, key_out, *keys = jr.split(key, 3 + 2 * len(widths))
+        size, widths = int(np.prod(shape)), list(widths)
+        self.embedding = embedding
+        self.inner = eqx.nn.Linear(size, widths[0], key=key_in)
+        self.time = eqx.nn.MLP(embedding, embedding, embedding, 1, jax.nn.silu, key=key_time)
+        ins = [widths[0], *widths[:-1]]
+        self.down = [_Level(a, b, embedding, key=k) for a, b, k in zip(ins, widths, keys[: len(widths)], strict=True)]
+        back = widths[::-1]
+        ins = [back[0], *back[:-1]]
+        self.up = [_Level(a + b, b, embedding, key=k) for a, b, k in zip(ins, back, keys[len(widths) :], strict=True)]
+        self.outer = eqx.nn.Linear(widths[0], size, key=key_out)
+
+    @classmethod
+    def build(cls, shape, widths, embedding, *, key: PRNGKeyArray) -> "WithState":
+        """The network with its running means."""
+        return WithState(*eqx.nn.make_with_state(cls)(shape, widths, embedding, key=key))
+
+    @classmethod
+    def published(cls, shape, num_bases: int, *, key: PRNGKeyArray) -> "WithState":
+        """The network for N basis functions or landmarks, in the plane."""
+        N = num_bases
+        return cls.build(shape, (8 * N, 4 * N, 2 * N, N), 4 * N, key=key)
+
+    def __call__(self, t, x, v, theta, state):
+        half = self.embedding // 2
+        angles = 100.0 * t * jnp.asarray(10000.0 ** (-np.arange(half) / half), x.dtype)
+        time = self.time(jnp.concatenate([jnp.sin(angles), jnp.cos(angles)]).astype(x.dtype))
+        h, kept = self.inner(x.ravel()), []
+        for level in self.down:
+            h, state = level(h, time, state)
+            kept.append(h)
+        for level in self.up:
+            h, state = level(jnp.concatenate([h, kept.pop()]), time, state)
+        return self.outer(h).reshape(x.shape), state
+
+
+class _Level(eqx.Module):
+    """Two dense layers, the time embedding between them, batch normalisation."""
+
+    first: eqx.nn.Linear
+    time: eqx.nn.Linear
+    second: eqx.nn.Linear
+    norm: eqx.nn.BatchNorm
+
+    def __init__(self, size_in: int, size: int, embedding: int, *, key: PRNGKeyArray):
+        keys = jr.split(key, 3)
+        self.first = eqx.nn.Linear(size_in, size, key=keys[0])
+        self.time = eqx.nn.Linear(embedding, size, key=keys[1])
+        self.second = eqx.nn.Linear(size, size, key=keys[2])
+        self.norm = eqx.nn.BatchNorm(size, axis_name="batch", mode="batch")
+
+    def __call__(self, x, time, state):
+        h = jax.nn.silu(self.first(x)) + self.time(time)
+        h, state = self.norm(jax.nn.silu(self.second(h)), state)
+        return h, state
+
+
+class WithState(eqx.Module):
+    """A network that keeps state between batches, `network(t, x, v, theta, state)`, as `eqx.nn.make_with_state` gives.
+
+    Called, it is in inference mode.
+    """
+
+    network: Any
+    state: eqx.nn.State
+
+    def __call__(self, t, x, v, theta):
+        return eqx.nn.inference_mode(self.network)(t, x, v, theta, self.state)[0]
+
+
+def over_batch(network, inputs):
+    """Outputs of rows of inputs, and the network with its state renewed."""
+    if isinstance(network, WithState):
+        mapped = jax.vmap(network.network, (0, 0, 0, 0, None), (0, None), axis_name="batch")
+        outputs, state = mapped(*inputs, network.state)
+        return outputs, WithState(network.network, state)
+    return jax.vmap(network)(*inputs), network
+
+
+def _zero(linear: eqx.nn.Linear) -> eqx.nn.Linear:
+    return jax.tree.map(jnp.zeros_like, linear)

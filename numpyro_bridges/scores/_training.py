@@ -1,0 +1,208 @@
+"""The training loop: whole chunks of updates on the device, an average of the iterates, the best of which is kept."""
+
+import os
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import optax
+from jaxtyping import Array, PRNGKeyArray
+from tqdm.auto import tqdm
+
+from .._checks import positive_integer, require
+
+
+class Training(eqx.Module):
+    """How a network is trained.
+
+    **Arguments:**
+
+    - `num_updates`: at most. `batch_size`: paths, or particles of a cloud, per update.
+    - `optimizer`: of optax; by default Adam with a warm-up of 50 updates and a cosine decay from `learning_rate`, the
+      gradient's norm clipped to 1.
+    - `average`: decay of the exponential average of the iterates, which is what is judged and returned; 0 is none.
+    - `interval`: updates between looks at the held-out paths. `held_out`: their number.
+    - `patience`: looks without a better one after which training stops; `None` does not stop and keeps the last network
+      in place of the best.
+    - `one_step`: the targets of score matching are those of one step, with all their noise, as was usual.
+
+    `Training.published()` is the schedule of Baker et al. (2024).
+    """
+
+    num_updates: int = eqx.field(static=True)
+    batch_size: int = eqx.field(static=True)
+    optimizer: optax.GradientTransformation = eqx.field(static=True)
+    average: float = eqx.field(static=True)
+    interval: int = eqx.field(static=True)
+    held_out: int = eqx.field(static=True)
+    patience: int | None = eqx.field(static=True)
+    one_step: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        num_updates: int = 2000,
+        batch_size: int = 64,
+        *,
+        learning_rate: float = 2e-3,
+        optimizer: optax.GradientTransformation | None = None,
+        average: float = 0.98,
+        interval: int = 100,
+        held_out: int = 256,
+        patience: int | None = 5,
+        one_step: bool = False,
+    ):
+        self.num_updates = positive_integer(num_updates, "num_updates")
+        self.batch_size = positive_integer(batch_size, "batch_size")
+        self.interval = min(positive_integer(interval, "interval"), self.num_updates)
+        self.held_out = positive_integer(held_out, "held_out")
+        require(0 <= average < 1, f"`average` must be in [0, 1); got {average}.")
+        require(learning_rate > 0, f"`learning_rate` must be positive; got {learning_rate}.")
+        if optimizer is None:
+            warm = min(50, self.num_updates // 4)
+            schedule = optax.warmup_cosine_decay_schedule(
+                0.0, learning_rate, warm, self.num_updates, 0.01 * learning_rate
+            )
+            optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+        self.optimizer, self.average = optimizer, average
+        self.patience, self.one_step = patience, bool(one_step)
+
+    @classmethod
+    def published(cls, num_epochs: int = 100) -> "Training":
+        """Epochs of 40 batches of 50 paths; 500 updates of warm-up, Adam from 1e-4 to 1e-6; one-step targets."""
+        total = 40 * positive_integer(num_epochs, "num_epochs")
+        schedule = optax.warmup_cosine_decay_schedule(0.0, 1e-4, min(500, total // 2), total, 1e-6)
+        return cls(total, 50, optimizer=optax.adam(schedule), average=0.0, interval=40, patience=None, one_step=True)
+
+
+class _State(eqx.Module):
+    """All that training needs to go on: saved as it is."""
+
+    network: Any
+    average: Any
+    optimizer: Any
+    best: Any
+    best_value: Array
+    waited: Array
+    update: Array
+    history: dict[str, Array]
+
+
+Loss = Callable[[Any, PRNGKeyArray], tuple[Array, Any]]
+Judge = Callable[[Any], tuple[Array, Array, Array]]
+
+
+def train(
+    network: Any,
+    loss: Loss,
+    judge: Judge,
+    key: PRNGKeyArray,
+    training: Training,
+    *,
+    name: str = "training",
+    file: Path | None = None,
+    progress: bool = True,
+) -> tuple[Any, dict[str, Array]]:
+    """The best network, and the history.
+
+    `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)` a value
+    to be maximised, the bound and the ESS fraction on held-out paths. Update i uses `fold_in(key, i)`: the same key
+    gives the same network, however often training is resumed from `file`.
+    """
+    optimizer, decay = training.optimizer, training.average
+    judge = eqx.filter_jit(judge)
+    looks = -(-training.num_updates // training.interval) + 1
+    empty = {k: jnp.full(looks, jnp.nan) for k in ("update", "loss", "bound", "ess", "seconds")}
+    arrays, static = eqx.partition(network, eqx.is_inexact_array)
+    state = _State(
+        arrays,
+        arrays,
+        optimizer.init(arrays),
+        arrays,
+        jnp.array(-jnp.inf),
+        jnp.zeros((), int),
+        jnp.zeros((), int),
+        empty,
+    )
+
+    @eqx.filter_jit
+    def advance(state: _State) -> tuple[_State, Array]:
+        def update(carry, i):
+            arrays, average, memory = carry
+
+            def value(arrays):
+                loss_value, renewed = loss(eqx.combine(arrays, static), jr.fold_in(key, i))
+                return loss_value, eqx.filter(renewed, eqx.is_inexact_array)
+
+            (batch_loss, renewed), gradient = jax.value_and_grad(value, has_aux=True)(arrays)
+            steps, memory = optimizer.update(gradient, memory, renewed)
+            arrays = optax.apply_updates(renewed, steps)
+            average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, average, arrays)
+            return (arrays, average, memory), batch_loss
+
+        start = state.network, state.average, state.optimizer
+        (arrays, average, memory), losses = jax.lax.scan(update, start, state.update + jnp.arange(training.interval))
+        new = (arrays, average, memory, state.update + training.interval)
+        where = lambda s: (s.network, s.average, s.optimizer, s.update)  # noqa: E731
+        return eqx.tree_at(where, state, new), losses
+
+    def look(state: _State, loss_value, seconds) -> _State:
+        value, bound, ess = judge(eqx.combine(state.average, static))
+        better = bool(value > state.best_value) or training.patience is None
+        i = int(state.update) // training.interval
+        row = {"update": state.update, "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
+        return eqx.tree_at(
+            lambda s: (s.best, s.best_value, s.waited, s.history),
+            state,
+            (
+                state.average if better else state.best,
+                jnp.where(better, value, state.best_value),
+                jnp.zeros((), int) if better else state.waited + 1,
+                {k: state.history[k].at[i].set(v) for k, v in row.items()},
+            ),
+        )
+
+    if file is not None and file.exists():
+        state = eqx.tree_deserialise_leaves(file, state)
+    else:
+        state = look(state, jnp.nan, 0.0)
+    spent = float(np.nanmax(np.asarray(state.history["seconds"])))
+    with tqdm(total=training.num_updates, initial=int(state.update), desc=name, disable=not progress) as bar:
+        while int(state.update) < training.num_updates and not _stopped(state, training):
+            begin = time.perf_counter()
+            new, losses = jax.block_until_ready(advance(state))
+            if not bool(jnp.all(jnp.isfinite(losses))):
+                first = int(state.update) + int(jnp.argmax(~jnp.isfinite(losses)))
+                warnings.warn(
+                    f"{name} stopped: the loss was not finite at update {first}. The network is the best of those "
+                    "before; a smaller `learning_rate` or more time steps may help.",
+                    stacklevel=3,
+                )
+                break
+            spent += time.perf_counter() - begin
+            state = look(new, jnp.mean(losses), spent)
+            if file is not None:
+                _save(file, state)
+            row = {k: float(v[int(state.update) // training.interval]) for k, v in state.history.items()}
+            bar.set_postfix_str(f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %")
+            bar.update(training.interval)
+    rows = np.isfinite(np.asarray(state.history["update"]))
+    return eqx.combine(state.best, static), {k: v[rows] for k, v in state.history.items()}
+
+
+def _stopped(state: _State, training: Training) -> bool:
+    return training.patience is not None and int(state.waited) >= training.patience
+
+
+def _save(file: Path, state: _State) -> None:
+    """Whole or not at all."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_suffix(".part")
+    eqx.tree_serialise_leaves(part, state)
+    os.replace(part, file)
