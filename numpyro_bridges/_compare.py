@@ -223,9 +223,9 @@ def _row(bridge: GuidedBridge, log_weights: np.ndarray, seconds: float, trained:
     # one particle has an ESS of 1 and a bounded tail, both without meaning
     ess = float(weights.effective_sample_size(log_weights)) if num_particles > 1 else math.nan
     pareto_k = float(weights.pareto_k(log_weights)) if num_particles > 1 else math.nan
-    if np.ptp(log_weights) <= rounding and num_particles > 1:
-        pareto_k = -math.inf  # and not the shape of the tail of rounding errors
     finite = math.isfinite(log_evidence) and math.isfinite(standard_error)
+    if finite and np.ptp(log_weights) <= rounding:
+        pareto_k = -math.inf  # and not the shape of the tail of rounding errors
     return {
         "log_evidence": log_evidence,
         "standard_error": standard_error,

@@ -13,7 +13,7 @@ def draw_comparison(rows: Mapping[str, Mapping[str, float | bool]], path: Any) -
     """The rows of a `Comparison` as three panels, written to a file; the `Figure`, closed."""
     plt = pyplot()
     size = (8.0, 1.0 + 0.42 * len(rows))
-    figure, axes = plt.subplots(1, 3, figsize=size, sharey=True, layout="constrained", width_ratios=[1.6, 1, 1])
+    figure, axes = plt.subplots(1, 3, figsize=size, sharey=True, layout="constrained", width_ratios=[1.4, 1, 1.2])
     colors = [START if row["trusted"] else NEUTRAL for row in rows.values()]
 
     def column(name: str) -> NDArray:
@@ -45,7 +45,7 @@ def _evidences(ax, values: NDArray, errors: NDArray, trusted: NDArray, colors: l
             words = "not to be trusted" if np.isfinite(values[i]) else f"{values[i]}, not to be trusted"
             place = {"xycoords": ("axes fraction", "data"), "ha": "left", "va": "bottom"}
             ax.annotate(words, (0.02, i - 0.12), fontsize=7, color=NEUTRAL, **place)
-    ax.set_xlabel("log evidence ± 2 SE")
+    ax.set_xlabel("log evidence ± 2 SE", fontsize=9)
     ax.margins(x=0.1)
 
 
@@ -56,7 +56,7 @@ def _bars(ax, values: NDArray, colors: list[str], label: str, totals: NDArray | 
     for i, (value, total) in enumerate(zip(values, totals, strict=True)):
         words = f"{value:.3g}" + (f", {total:.3g}" if total > value else "")
         ax.annotate(words, (_finite(total), i), (3, 0), textcoords="offset points", va="center", fontsize=8)
-    ax.set_xlabel(label)
+    ax.set_xlabel(label, fontsize=9)
     ax.set_xlim(0.0, 1.5 * max(_finite(totals).max(), np.finfo(float).tiny))
     ax.spines["bottom"].set_visible(False)
     ax.set_xticks([])
