@@ -255,6 +255,7 @@ class GuidedBridge(eqx.Module):
         )
         return x
 
+    @_pure_method
     def log_h(self, t: RealScalar, x: State) -> Float[Array, ""]:
         """log h̃(t, x) of the guide, t before t1: log density of the datum, or log probability of the set, from x."""
         x = self._before_the_end(t, x)
@@ -262,6 +263,7 @@ class GuidedBridge(eqx.Module):
         message = self._message(t, x, jnp.zeros_like(apply(seen.operator, x)))
         return self.condition.log_value(apply(message.operator, x) + message.shift, message.factor) + seen.log_scale
 
+    @_pure_method
     def score(self, t: RealScalar, x: State) -> State:
         """∇ log h̃(t, x), the guide's covariance held fixed: where the path is pulled, before a(x) acts on it.
 
