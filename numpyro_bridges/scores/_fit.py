@@ -1,7 +1,7 @@
 """Training of learned guides: what is the same for every method, and the three methods.
 
 - `residual`: the evidence bound E log w is maximised (Yang, van der Meulen and Sommer 2025).
-- `adjoint`: score matching on the weighted reversed process from the observation (Baker, Schauer and Sommer 2024).
+- `adjoint`: score matching on the weighted reversed process from the observation (Baker, Schauer and Sommer 2025).
 - `reversal`: score matching of the unconditioned process gives the time reversal; score matching on its paths gives the
   bridge (Heng, De Bortoli, Doucet and Thornton 2021), twice reversed.
 """

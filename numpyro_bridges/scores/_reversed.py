@@ -6,7 +6,7 @@ the backward equation, read in τ, is its density weighted by exp ∫ c,
     c = ½ ∇·div a − ∇·b,
 
 so that h(t, ·) is the law of a weighted cloud that starts at what is observed (Milstein, Schoenmakers and Spokoiny
-2004; Baker, Schauer and Sommer 2024). Guided by ∇log p(t, ·), the density of the SDE itself, it is the time reversal
+2004; Baker, Schauer and Sommer 2025). Guided by ∇log p(t, ·), the density of the SDE itself, it is the time reversal
 (Haussmann and Pardoux 1986).
 """
 
