@@ -184,7 +184,7 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
 
     unguided = isinstance(bridge.guide, Unguided)
     candidates = [backwards(guide) for guide in ([lambda _: Unguided()] if unguided else [_linearised, _driftless])]
-    errors = [float(loss(problem.guide.network, key_judge)[0]) for _, loss in candidates]
+    errors = [float(eqx.filter_jit(loss)(problem.guide.network, key_judge)[0]) for _, loss in candidates]
     back, loss = candidates[errors.index(min(errors))]
 
     def judge(network):
