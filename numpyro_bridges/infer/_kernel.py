@@ -20,7 +20,7 @@ from numpyro.infer.util import constrain_fn
 from numpyro.util import is_prng_key
 
 from .._checks import concrete, require
-from ._posterior import Sites, init_to_guided_mean, is_noise, misfit
+from ._posterior import Sites, init_to_guided_mean, is_latent, is_noise, misfit, sites_of
 from ._reference import Reference, laplace
 
 
@@ -109,9 +109,8 @@ class AbstractBridgeKernel(MCMCKernel):
 
     def _latent(self, key, strategy, model_args, model_kwargs):
         """The latent sites, with values by an initialisation strategy."""
-        model = numpyro.handlers.substitute(numpyro.handlers.seed(self._model, key), substitute_fn=strategy)
-        trace = numpyro.handlers.trace(model).get_trace(*model_args, **model_kwargs)
-        return {k: site for k, site in trace.items() if site["type"] == "sample" and not site["is_observed"]}
+        sites = sites_of(self._model, model_args, model_kwargs, key, strategy)
+        return {k: site for k, site in sites.items() if is_latent(site)}
 
     def _check(self, model_args, model_kwargs):
         sites = self._latent(0, init_to_sample, model_args, model_kwargs)
