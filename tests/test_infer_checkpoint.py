@@ -138,7 +138,10 @@ def test_as_after_run(tmp_path, capsys):
     assert "mean" in capsys.readouterr().out
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ArviZ 0.x announces 1.x when it is imported
-        data = nb.to_arviz(mcmc)
+        data, all_paths = nb.to_arviz(mcmc, paths=9), nb.to_arviz(plain, paths=SAMPLES)
+    paths, expected_paths = data["posterior_paths"]["wing"], all_paths["posterior_paths"]["wing"]
+    np.testing.assert_array_equal(paths["draw"], range(1, SAMPLES // 3, 2))
+    np.testing.assert_allclose(paths, expected_paths.sel(draw=paths["draw"]), rtol=1e-9)
     np.testing.assert_array_equal(data.posterior["mean"], found["mean"])
     assert "log_likelihood" not in str(data)
 

@@ -9,12 +9,12 @@ the bridge's weights adds to that of the importance ratios: read Pareto k̂.
 import jax
 import numpy as np
 import numpyro
-from numpyro.infer import MCMC, init_to_sample
+from numpyro.infer import MCMC
 from numpyro.ops.provenance import eval_provenance
 
 from .._checks import positive_integer, require
 from ..distributions import DiffusionEndpoint
-from ._posterior import is_noise
+from ._posterior import is_latent, is_noise, sites_of
 from ._statistics import statistics
 
 
@@ -37,7 +37,8 @@ def to_arviz(
     - `prior`, `posterior_predictive`: dictionaries from `numpyro.infer.Predictive`.
     - `coords`, `dims`: as in ArviZ; plates name their axes.
     - `noise`: keep the driving noise in the posterior.
-    - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all; none by default.
+    - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all whose noise was kept;
+      none by default.
 
     **Returns:** an `InferenceData` (ArviZ 0.x) or a `DataTree` (1.x) with the groups of the dictionaries and
 
@@ -54,13 +55,12 @@ def to_arviz(
     """
     model = getattr(mcmc.sampler, "model", None)
     require(callable(model), "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.")
-    sites = _sites(model, mcmc._args, mcmc._kwargs)
+    sites = sites_of(model, mcmc._args, mcmc._kwargs)
     observed = {name: site["value"] for name, site in sites.items() if _is_datum(site)}
     hidden = set() if noise else {name for name, site in sites.items() if is_noise(site)}
     dims = _plates(sites) | (dims or {})
     samples = mcmc.get_samples(group_by_chain=True)
     shape = next(iter(samples.values())).shape[:2]
-    lost = {name: site["value"] for name, site in sites.items() if _is_latent(site) and name not in samples}
 
     def replay(values, names):
         at_values = numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), data=values)
@@ -76,31 +76,37 @@ def to_arviz(
     def visible(draws, shape=None):
         return {k: v if shape is None else _regrouped(v, shape) for k, v in draws.items() if k not in hidden}
 
-    def unknown(fn, names):
+    def lost(samples):
+        return {name: site["value"] for name, site in sites.items() if is_latent(site) and name not in samples}
+
+    def unknown(fn, names, samples):
         """Names of the sites for which `fn` needs what is lost."""
         first = {name: value[0, 0] for name, value in samples.items()}
-        needs = eval_provenance(lambda lost: fn(first | lost, names), lost=lost) if lost else {}
+        needs = eval_provenance(lambda lost: fn(first | lost, names), lost=lost(samples)) if lost(samples) else {}
         return {name for name, sources in needs.items() if frozenset().union(*jax.tree.leaves(sources))}
 
-    lacking = unknown(log_likelihood, observed)
+    lacking = unknown(log_likelihood, observed, samples)
     known = [name for name in observed if name not in lacking]
     datasets = {}
     if paths is not None:
-        kept = np.linspace(0, shape[1] - 1, min(positive_integer(paths, "paths"), shape[1])).astype(int)
+        paths, (draws, driving) = positive_integer(paths, "paths"), _with_noise(mcmc)
+        places = np.linspace(0, len(draws) - 1, min(paths, len(draws))).astype(int)
+        kept = draws[places]
         driven = [name for name in observed if isinstance(sites[name]["fn"], DiffusionEndpoint)]
         require(driven, f"`paths` needs an observed `DiffusionEndpoint`; the model observes {sorted(observed)}.")
         require(
-            not unknown(bridges, driven),
-            f"`paths` needs the noise that drives {driven}, and the run has not kept {sorted(lost)}. Run it without "
-            f"{[f'~z.{name}' for name in sorted(lost)]} in `extra_fields`; if it is checkpointed, with `keep_noise=1`.",
+            not unknown(bridges, driven, driving),
+            f"`paths` needs the noise that drives {driven}, and the run has not kept {sorted(lost(driving))}. Run it "
+            f"without {[f'~z.{name}' for name in sorted(lost(driving))]} in `extra_fields`; if it is checkpointed, "
+            "with `keep_noise`, of at most `num_samples`.",
         )
-        found = _mapped(lambda draw: bridges(lost | draw, driven), samples, kept)
+        found = _mapped(lambda draw: bridges(lost(driving) | draw, driven), driving, places)
         leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven}
         datasets["posterior_paths"] = _labelled(found, leading, kept, coords or {})
     groups = {
         "posterior": visible(samples),
         "sample_stats": statistics(mcmc.get_extra_fields(group_by_chain=True), mcmc.sampler),
-        "log_likelihood": _mapped(lambda draw: log_likelihood(lost | draw, known), samples) if known else {},
+        "log_likelihood": _mapped(lambda draw: log_likelihood(lost(samples) | draw, known), samples) if known else {},
         "observed_data": observed,
     }
     if posterior_predictive is not None:
@@ -113,15 +119,15 @@ def to_arviz(
     return _from_groups(groups, datasets, coords, dims)
 
 
-def _sites(model, args, kwargs) -> dict:
-    """Sample and deterministic sites of the model at its data."""
-    model = numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), substitute_fn=init_to_sample)
-    trace = numpyro.handlers.trace(model).get_trace(*args, **kwargs)
-    return {name: site for name, site in trace.items() if site["type"] in ("sample", "deterministic")}
-
-
-def _is_latent(site) -> bool:
-    return site["type"] == "sample" and not site["is_observed"]
+def _with_noise(mcmc):
+    """Indices of the draws whose noise is there, and the values of those draws."""
+    samples = mcmc.get_samples(group_by_chain=True)
+    draws = np.arange(next(iter(samples.values())).shape[1])
+    noise, every = mcmc.get_extra_fields(group_by_chain=True).get("noise"), getattr(mcmc, "_keep_noise", None)
+    if not isinstance(noise, dict) or not every or every > len(draws):
+        return draws, samples
+    draws = draws[every - 1 :: every]
+    return draws, {name: value[:, draws] for name, value in samples.items()} | noise
 
 
 def _is_datum(site) -> bool:

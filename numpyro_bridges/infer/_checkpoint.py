@@ -25,14 +25,13 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-import numpyro
 from jax.tree_util import keystr, tree_flatten_with_path
-from numpyro.infer import MCMC, init_to_sample
+from numpyro.infer import MCMC
 from numpyro.util import is_prng_key, nested_attrgetter
 from tqdm.auto import tqdm
 
 from .._checks import positive_integer, require
-from ._posterior import noise_sites
+from ._posterior import noise_sites, sites_of
 
 
 def run_checkpointed(
@@ -51,8 +50,8 @@ def run_checkpointed(
 
         run_checkpointed(mcmc, "wings_run", jax.random.key(0), wings)  # and after a crash: the same line again
 
-    The draws are, bit for bit, those of a run that was never cut off, given the same machine and versions. Afterwards
-    `mcmc` is as after `run`. The same call with a larger `num_samples` makes a chain longer. With thinning by k,
+    The draws are, bit for bit, those of a run that was never cut off, given the same machine, devices and versions.
+    Afterwards `mcmc` is as after `run`. The same call with a larger `num_samples` makes a chain longer. With thinning by k,
     draws k, 2k, ... after the warm-up are kept.
 
     **Arguments:**
@@ -62,7 +61,7 @@ def run_checkpointed(
     - `rng_key`, `args`, `kwargs`, `extra_fields`, `init_params`: as for `run`.
     - `interval`: the number of iterations, warm-up included, between two savings: at most as many are lost to a kill.
     - `keep_noise`: by default the driving noise of the draws is dropped. With k > 1 every k-th draw's is kept, in
-      `mcmc.get_extra_fields()["noise"]`; with 1 it stays among the samples.
+      `mcmc.get_extra_fields()["noise"]`, for the bridges of `to_arviz`; with 1 it stays among the samples.
 
     **Errors:** `ValueError` if `path` holds a run with other settings or arguments, or something else. Ctrl-C raises
     `KeyboardInterrupt`, after `mcmc` has been given the draws of all complete intervals.
@@ -229,8 +228,7 @@ def _chain(x, c):
 def _noise_of(sampler, args, kwargs) -> tuple[str, ...]:
     if not callable(model := getattr(sampler, "model", None)):
         return ()
-    model = numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), substitute_fn=init_to_sample)
-    return noise_sites(numpyro.handlers.trace(model).get_trace(*args, **kwargs))
+    return noise_sites(sites_of(model, args, kwargs))
 
 
 def _array(x):
@@ -347,3 +345,4 @@ def _hand_over(folder, chains, state, done) -> None:
     mcmc._last_state = jax.tree.map(jnp.asarray, state)
     mcmc._states = jax.tree.map(jnp.asarray, _rebuilt(draws, chains.draw)) if draws else None
     mcmc._states_flat = None
+    mcmc._keep_noise = chains.keep_noise  # for `to_arviz`

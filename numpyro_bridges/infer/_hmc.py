@@ -22,7 +22,7 @@ from .._checks import require
 from ._kernel import AbstractBridgeKernel
 from ._posterior import Sites, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
-from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
+from ._rotation import choose, half_square, kick, metropolis, normal_like, rotate, total
 from ._step_size import StepSize, start_step_size, update_step_size
 
 _MAX_ENERGY_ERROR = 1000.0  # a transition above it is called divergent, as in NumPyro
@@ -148,9 +148,7 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         error = new - old + work
         rate, accept = metropolis(key_accept, error)
         moved = to_sites(x), new + half_square(x[0]), unravel(reference.colour_gradient(slope + x[0])) | force
-        z, phi, gradient = jax.tree.map(
-            lambda new, old: jnp.where(accept, new, old), moved, (state.z, state.misfit, state.gradient)
-        )
+        z, phi, gradient = choose(accept, moved, (state.z, state.misfit, state.gradient))
         potential = phi + half_square(self._parts(z)[1])
         return FunctionSpaceHMCState(
             state.i + 1,
@@ -177,4 +175,4 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
             last = state.i == self._num_warmup - 1
             step = update_step_size(step, self._target - rate, bounds, renew=renewed, last=last)
         new = AdaptState(*step, windows)
-        return jax.tree.map(lambda new, old: jnp.where(self._warming(state), new, old), new, adapt)
+        return choose(self._warming(state), new, adapt)

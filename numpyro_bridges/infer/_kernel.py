@@ -1,6 +1,7 @@
 """What the kernels share: they are NumPyro kernels of a model whose noise carries the `driving_noise` mark."""
 
 import copy
+import math
 from abc import abstractmethod
 from functools import partial
 
@@ -10,6 +11,7 @@ import jax.random as jr
 import numpy as np
 import numpyro
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, PartitionSpec
 from numpyro.distributions import biject_to
 from numpyro.infer import init_to_sample
 from numpyro.infer.gibbs import GIBBS_SITES_KWARG
@@ -18,7 +20,7 @@ from numpyro.infer.util import constrain_fn
 from numpyro.util import is_prng_key
 
 from .._checks import concrete, require
-from ._posterior import Sites, init_to_guided_mean, is_noise, misfit
+from ._posterior import Sites, init_to_guided_mean, is_latent, is_noise, misfit, sites_of
 from ._reference import Reference, laplace
 
 
@@ -66,9 +68,13 @@ class AbstractBridgeKernel(MCMCKernel):
             z, reference = self._near_the_mode(key_reference, z, init_params is not None, model_args, model_kwargs)
             return self._init_one(key, z, reference, model_args, model_kwargs)
 
-        single = is_prng_key(rng_key)
-        self._sample_fn = self._sample_one if single else jax.vmap(self._sample_one, (0, None, None))
-        state = jax.jit(one if single else jax.vmap(one))(rng_key, init_params)
+        over_chains = (lambda fn: fn) if is_prng_key(rng_key) else partial(_over_chains, num_chains=len(rng_key))
+
+        def sample(state, model_args, model_kwargs):
+            return over_chains(lambda state: self._sample_one(state, model_args, model_kwargs))(state)
+
+        self._sample_fn = sample
+        state = jax.jit(over_chains(one))(rng_key, init_params)
         potential = concrete(state.potential_energy)
         require(
             potential is None or bool(np.all(np.isfinite(potential))),
@@ -103,9 +109,8 @@ class AbstractBridgeKernel(MCMCKernel):
 
     def _latent(self, key, strategy, model_args, model_kwargs):
         """The latent sites, with values by an initialisation strategy."""
-        model = numpyro.handlers.substitute(numpyro.handlers.seed(self._model, key), substitute_fn=strategy)
-        trace = numpyro.handlers.trace(model).get_trace(*model_args, **model_kwargs)
-        return {k: site for k, site in trace.items() if site["type"] == "sample" and not site["is_observed"]}
+        sites = sites_of(self._model, model_args, model_kwargs, key, strategy)
+        return {k: site for k, site in sites.items() if is_latent(site)}
 
     def _check(self, model_args, model_kwargs):
         sites = self._latent(0, init_to_sample, model_args, model_kwargs)
@@ -151,3 +156,15 @@ class AbstractBridgeKernel(MCMCKernel):
         n = jnp.where(self._warming(state), state.i, state.i - self._num_warmup) + 1
         mean = jnp.where(n == 1, 0.0, state.mean_accept_prob)
         return mean + (rate - mean) / n
+
+
+def _over_chains(fn, num_chains: int):
+    """`fn` of one chain, for all of them: vectorised, in equal shares on as many of the devices as that allows.
+
+    Each device has a loop of its own: none waits for another's longer trajectory.
+    """
+    devices = jax.local_devices()[: math.gcd(num_chains, jax.local_device_count())]
+    if len(devices) == 1:
+        return jax.vmap(fn)
+    mesh, chains = Mesh(np.array(devices), "chains"), PartitionSpec("chains")
+    return jax.shard_map(jax.vmap(fn), mesh=mesh, in_specs=chains, out_specs=chains, check_vma=False)

@@ -13,7 +13,7 @@ import numpyro
 import numpyro.distributions as dist
 from jax import Array
 from numpyro.distributions import constraints
-from numpyro.infer import init_to_median
+from numpyro.infer import init_to_median, init_to_sample
 from numpyro.infer.util import potential_energy
 from numpyro.primitives import Messenger
 
@@ -27,6 +27,17 @@ def init_to_guided_mean(site=None, num_samples: int = 15):
     if site is not None and is_noise(site):
         return jnp.zeros(site["fn"].shape())
     return init_to_median(site, num_samples)
+
+
+def sites_of(model, model_args, model_kwargs, key=0, strategy=init_to_sample) -> dict:
+    """Sample and deterministic sites of a model at its data, with values by an initialisation strategy."""
+    model = numpyro.handlers.substitute(numpyro.handlers.seed(model, key), substitute_fn=strategy)
+    trace = numpyro.handlers.trace(model).get_trace(*model_args, **model_kwargs)
+    return {name: site for name, site in trace.items() if site["type"] in ("sample", "deterministic")}
+
+
+def is_latent(site) -> bool:
+    return site["type"] == "sample" and not site["is_observed"]
 
 
 def is_noise(site) -> bool:
@@ -78,9 +89,10 @@ def misfit(model, model_args, model_kwargs, z: Sites) -> Array:
 
 def energies_of(model, model_args, model_kwargs, z: Sites, owners) -> tuple[Array, tuple[Array, ...]]:
     """`rest`, and energies -log p(v_s | θ, z_s), an array for each noise; 0 and Φ where `owners` is `None`."""
-    rest, log_likelihood = split(model, model_args, model_kwargs, z)
     if owners is None:
-        return jnp.zeros_like(rest), (rest - sum(map(jnp.sum, log_likelihood.values())),)
+        phi = misfit(model, model_args, model_kwargs, z)
+        return jnp.zeros_like(phi), (phi,)
+    rest, log_likelihood = split(model, model_args, model_kwargs, z)
     return rest, tuple(-log_likelihood[owners[noise]] for noise in sorted(owners))
 
 

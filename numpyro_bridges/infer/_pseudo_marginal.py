@@ -27,7 +27,7 @@ from .._checks import concrete, positive_integer, require
 from ._kernel import AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
-from ._rotation import kick, metropolis, normal_like, rotate, total
+from ._rotation import choose, kick, metropolis, normal_like, rotate, total
 
 _PILOT = 256  # bridges by which the number of particles is chosen
 _BEST_SD = 1.7  # of the log estimate, at most: above it chains stick; far below 1, particles are wasted
@@ -186,9 +186,9 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         rate, accept = metropolis(key_accept, error)
         moved = unravel(theta_new) | self._pick(key_pick, particles, energies), particles, value, force
         kept = state.z, state.particles, state.potential_energy, state.force
-        z, particles, value, force = jax.tree.map(lambda new, old: jnp.where(accept, new, old), moved, kept)
+        z, particles, value, force = choose(accept, moved, kept)
         windows, _ = update_windows(state.windows, state.i, self._num_warmup, self._parts(z)[0])
-        windows = jax.tree.map(lambda new, old: jnp.where(self._warming(state), new, old), windows, state.windows)
+        windows = choose(self._warming(state), windows, state.windows)
         mean = self._running_mean(state, rate)
         return PseudoMarginalState(
             state.i + 1, z, particles, value, force, step_size, windows, rate, mean, jnp.isnan(error), key

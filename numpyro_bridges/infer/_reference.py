@@ -6,12 +6,13 @@ windows of the warm-up. y has the role of the noise: N(0, I) but for what the ke
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.optimize import minimize
 from numpyro.infer.hmc_util import welford_covariance
+
+from ._rotation import choose
 
 
 class Reference(NamedTuple):
@@ -68,9 +69,9 @@ def update_windows(windows: Windows, i: Array, num_warmup: int, theta: Array) ->
         return windows, jnp.array(False)
     inside = (i >= starts[0]) & (i < ends[-1])
     ends = jnp.any(i + 1 == jnp.array(ends))
-    moments = _where(inside, _add(theta, windows.moments), windows.moments)
+    moments = choose(inside, _add(theta, windows.moments), windows.moments)
     renewed = start_windows(_if_finite(_from_moments(*moments), windows.reference))
-    return _where(ends, renewed, windows._replace(moments=moments)), ends
+    return choose(ends, renewed, windows._replace(moments=moments)), ends
 
 
 def _schedule(num_warmup: int):
@@ -88,8 +89,4 @@ def _from_moments(mean, m2, n) -> Reference:
 
 def _if_finite(new: Reference, old: Reference) -> Reference:
     good = jnp.all(jnp.isfinite(new.scale)) & jnp.all(jnp.diag(new.scale) > 0) & jnp.all(jnp.isfinite(new.mean))
-    return _where(good, new, old)
-
-
-def _where(condition, new, old):
-    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
+    return choose(good, new, old)

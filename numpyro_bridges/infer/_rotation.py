@@ -25,6 +25,11 @@ def metropolis(key, error: jax.Array):
     return rate, jr.uniform(key, rate.shape, rate.dtype) < rate
 
 
+def choose(condition, new, old):
+    """Of two pytrees, the new one where a condition holds."""
+    return jax.tree.map(lambda new, old: jnp.where(condition, new, old), new, old)
+
+
 def half_square(x):
     """½ |x|²."""
     return 0.5 * total(jax.tree.map(jnp.square, x))

@@ -2,10 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from numpyro.infer.hmc_util import dual_averaging
+
+from ._rotation import choose
 
 _start, _update = dual_averaging()
 
@@ -29,4 +30,4 @@ def update_step_size(step: StepSize, shortfall, bounds, *, renew, last) -> StepS
     mean = jnp.clip(jnp.exp(log_mean), *bounds)
     value = jnp.where(renew | last, mean, jnp.clip(jnp.exp(log_value), *bounds))
     again = start_step_size(mean)
-    return jax.tree.map(lambda again, on: jnp.where(renew, again, on), again, StepSize(value, averaging))
+    return choose(renew, again, StepSize(value, averaging))
