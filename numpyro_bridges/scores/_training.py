@@ -141,8 +141,9 @@ def train(
                 return loss_value, eqx.filter(renewed, eqx.is_inexact_array)
 
             (batch_loss, renewed), gradient = jax.value_and_grad(value, has_aux=True)(arrays)
-            steps, memory = optimizer.update(gradient, memory, renewed)
-            arrays = optax.apply_updates(renewed, steps)
+            with jax.numpy_dtype_promotion("standard"):  # optax needs it
+                steps, memory = optimizer.update(gradient, memory, renewed)
+                arrays = optax.apply_updates(renewed, steps)
             average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, average, arrays)
             return (arrays, average, memory), batch_loss
 
@@ -156,7 +157,7 @@ def train(
         value, bound, ess = judge(eqx.combine(state.average, static))
         better = bool(value > state.best_value) or training.patience is None
         i = int(state.update) // training.interval
-        row = {"update": state.update, "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
+        row = {"update": float(state.update), "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
         return eqx.tree_at(
             lambda s: (s.best, s.best_value, s.waited, s.history),
             state,
