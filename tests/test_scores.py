@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+import numpyro
 import optax
 import pytest
 import scipy.linalg
@@ -30,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("compile_quickly")
 
 # Clouds.
 
-K = 20
+K = 40
 TS = np.linspace(0, 1, K + 1)
 
 
@@ -105,17 +106,19 @@ def mean_and_error(values):
      ("geometric", "forward")],
 )  # fmt: skip
 def test_targets_are_scores_on_average(model, method):
-    """E (g − s) φ(x) = 0 for s the closed form and φ = 1, x: within 3 SE, and 1.5 % for the steps' length, at any ρ.
+    """E (g − s) φ(x) = 0 for s the closed form and φ = 1, x: within 3 SE, and 2 % for the steps' length, at any ρ.
 
     In units in which φ = x gives 1 for an error of the whole of s.
     """
     bridge, score, score_forward = MODELS[model]()
     make, times = clouds(bridge, method)
     truth = score_forward if method == "forward" else score
-    draw = jax.jit(lambda keys, rho: jax.lax.map(lambda key: make(key, 1000, rho), keys))
+    draw = jax.jit(lambda keys, rho: jax.lax.map(lambda key: make(key, 500, rho), keys))
+    fitted = jax.jit(lambda key: make(key, 500).rho)(jr.key(2))
+    half = 0.5 * (fitted > 0)  # an end that is fixed does not move
 
-    for rho in (None, 0.0, 0.5):
-        cloud = draw(jr.split(jr.key(1), 20), None if rho is None else jnp.full(K, rho))
+    for rho in (fitted, 0 * half, half):
+        cloud = draw(jr.split(jr.key(1), 20), rho)
         x, g, w = (np.asarray(a) for a in (cloud.x, cloud.score, cloud.weights[..., None]))
         np.testing.assert_allclose(np.sum(w, 2), 1.0, rtol=1e-10)
         flat = np.moveaxis(x, 1, 0).reshape(K, -1, x.shape[-1])
@@ -125,25 +128,23 @@ def test_targets_are_scores_on_average(model, method):
         gap = (g - s) * sd
         gaps = np.concatenate([np.mean(np.sum(w * gap * phi, 2), 1) for phi in (1.0, (x - mean) / sd)], 1)
         gap, error = mean_and_error(gaps)
-        print(rho, gap, error)
-        assert np.all(error < 0.012)
-        assert np.all(np.abs(gap) < 3 * error + 0.015)
+        print(gap, error)
+        assert np.all(error < 0.015)
+        assert np.all(np.abs(gap) < 3 * error + 0.02)
 
 
 def test_rho_takes_the_noise_from_the_targets():
-    """Brownian motion to an exact end: g = −(x − v)/(1 − t) without noise at ρ_j = j/(j + 1), against one-step targets."""
+    """Brownian motion to an exact end: g = −(x − v)/(1 − t) without noise at ρ_j = j/(j + 1), unlike at ρ = 0."""
     bridge, score, _ = linear([0.0], [1.0], [0.0], [0.2], [0.9], 0.0)
-    for sde in (nb.BrownianMotion(1.0), bridge.sde):
-        brownian = nb.GuidedBridge(sde, bridge.condition, x0=bridge.x0, ts=TS)
 
-        def noise(rho, brownian=brownian):
-            cloud = adjoint_cloud(brownian, jr.key(0), 1000, rho)
-            s = np.stack([score(t, x) for t, x in zip(TS, np.asarray(cloud.x), strict=False)])
-            return np.var(cloud.score - s), cloud.rho
+    def noise(rho):
+        cloud = jax.jit(lambda key: adjoint_cloud(bridge, key, 1000, rho))(jr.key(0))
+        s = np.stack([score(t, x) for t, x in zip(TS, np.asarray(cloud.x), strict=False)])
+        return np.var(cloud.score - s), cloud.rho
 
-        fitted, rho = noise(None)
-        assert fitted < 1e-3 * noise(jnp.zeros(K))[0]
-        np.testing.assert_allclose(rho[::-1], np.arange(K) / np.arange(1, K + 1), atol=0.02)
+    fitted, rho = noise(None)
+    assert fitted < 1e-3 * noise(jnp.zeros(K))[0]
+    np.testing.assert_allclose(rho[::-1], np.arange(K) / np.arange(1, K + 1), atol=0.06)
 
 
 # A weighted cloud with a rate c that varies.
@@ -178,9 +179,9 @@ def test_the_weighted_adjoint_process_is_h(name):
     sde, drift, diffusion, v, scale = SCALARS[name]
     ts = np.linspace(0, 1, 201)
     bridge = nb.GuidedBridge(sde, nb.ExactMatch().at([v]), x0=[0.0], ts=ts)
-    cloud = jax.jit(lambda keys: jax.lax.map(lambda key: adjoint_cloud(bridge, key, 1000), keys))(
-        jr.split(jr.key(0), 20)
-    )
+    rho = jax.jit(lambda key: adjoint_cloud(bridge, key, 1000).rho)(jr.key(1))
+    draw = jax.jit(lambda keys: jax.lax.map(lambda key: adjoint_cloud(bridge, key, 1000, rho), keys))
+    cloud = draw(jr.split(jr.key(0), 20))
     ts, x, g, w = ts[:-1], *(np.asarray(a) for a in (cloud.x[..., 0], cloud.score[..., 0], cloud.weights))
     for k in (100, 150):
         grid, h = backward_density(drift, diffusion, v, 1 - ts[k])
@@ -193,7 +194,7 @@ def test_the_weighted_adjoint_process_is_h(name):
             size = np.sqrt(np.sum(h * slope(grid) ** 2) / np.sum(h))
             found, error = mean_and_error(np.sum(w[:, k] * (g[:, k] * f(x[:, k]) + slope(x[:, k])), 1) / size)
             print(name, k, "score", found, error)
-            assert error < 0.05 and abs(found) < 3 * error
+            assert error < 0.08 and abs(found) < 3 * error
 
 
 def test_rate_and_drift_of_the_reversed_process(key):
@@ -434,7 +435,7 @@ def test_networks_start_at_zero(key):
 
 def test_a_point_network_sees_a_set_of_points(key):
     """It commutes with relabelling, and has a limit in the number of points, reached fast on a smooth curve."""
-    network = jax.jit(randomised(nb.scores.PointNetwork(2, 1, key=key, width=8), key))
+    network = eqx.filter_jit(randomised(nb.scores.PointNetwork(2, 1, key=key, width=8), key))
     t, theta = jnp.array(0.3), jnp.ones(1)
     v, x = (jnp.asarray(a) for a in curve(8))
     order = np.random.default_rng(0).permutation(8)
@@ -449,23 +450,18 @@ def test_a_point_network_sees_a_set_of_points(key):
     assert gaps[0] > gaps[1] > gaps[2] and gaps[2] < 0.02
 
 
-def landmark_guide(key, context=None):
-    network = randomised(nb.scores.PointNetwork(2, 0, key=key, width=8), key)
-    return ScoreGuide(nb.RecedingGuide(), network, plain_standard())
-
-
 def test_a_guide_of_landmarks_does_not_see_translations(key):
     v, x0 = curve(6)
-    x = v + 0.3 * x0
+    network = randomised(nb.scores.PointNetwork(2, 0, key=key, width=8), key)
+    guide = ScoreGuide(nb.scores.Unguided(), network, plain_standard())
 
-    def score(shift):
+    @jax.jit
+    def network_score(shift):
         flow = nb.KunitaFlow(nb.Landmarks(6, 2), nb.GaussianKernel(0.3, 0.7))
-        bridge = nb.GuidedBridge(flow, nb.InexactMatch(0.1).at(v + shift), x0=x + shift, ts=[0.0, 0.5, 1.0])
-        plain = bridge.with_guide(nb.RecedingGuide()).score(0.5, x + shift)
-        return bridge.with_guide(landmark_guide(key)).score(0.5, x + shift) - plain
+        bridge = nb.GuidedBridge(flow, nb.InexactMatch(0.1).at(v + shift[None]), x0=v, ts=[0.0, 0.5, 1.0], guide=guide)
+        return bridge.score(0.5, v + 0.3 * x0 + shift[None])
 
-    with jax.disable_jit():
-        here, there = score(0.0), score(np.array([0.7, -1.2]))
+    here, there = network_score(jnp.zeros(2)), network_score(jnp.array([0.7, -1.2]))
     assert np.max(np.abs(here)) > 1e-3
     np.testing.assert_allclose(here, there, rtol=1e-6, atol=1e-9)
 
@@ -514,3 +510,100 @@ def test_an_exact_guide_is_not_spoilt(method):
     found = jax.jit(jax.vmap(bridge.with_guide(score).log_weight))(z)
     assert np.ptp(np.asarray(found)) < 1e-10
     np.testing.assert_allclose(found[0], bridge.log_weight(z[0]), rtol=1e-10)
+
+
+def test_an_amortised_guide_serves_other_parameters_and_targets():
+    """Trained over (rate, target): more effective paths than its guide has, at pairs not drawn in training."""
+    guide, match = nb.FrozenGuide(nb.BrownianMotion(0.25)), nb.ExactMatch()
+
+    def draw(key):
+        rate, v = jr.uniform(key, (2,))
+        return nb.LinearSDE(-0.5 - 3 * rate, 0.5), match.at(jnp.stack([2 * v - 1])), jnp.array([0.3])
+
+    sde, condition, x0 = draw(jr.key(0))
+    score = nb.scores.fit(
+        sde,
+        condition,
+        x0=x0,
+        t1=1.0,
+        num_steps=10,
+        key=jr.key(1),
+        guide=guide,
+        network=nb.scores.MLP((1, 1), 1, key=jr.key(2), width=16, depth=2),
+        draw=draw,
+        context=lambda sde: jnp.stack([sde.drift_operator]),
+        training=nb.scores.Training(200, 64, learning_rate=1e-2, interval=200),
+        progress=False,
+    )
+
+    @jax.jit
+    def lost(key):
+        """1 − ESS as a fraction, with the guide and with the network on it."""
+        sde, condition, x0 = draw(key)
+        bridge = nb.GuidedBridge(sde, condition, x0=x0, t1=1.0, num_steps=10, guide=guide)
+        z = jr.normal(key, (200, *bridge.noise_shape))
+        log_weights = [jax.vmap(b.log_weight)(z) for b in (bridge, bridge.with_guide(score))]
+        return jnp.stack([1 - nb.weights.effective_sample_size(w) / 200 for w in log_weights])
+
+    before, after = np.mean([lost(key) for key in jr.split(jr.key(3), 20)], axis=0)
+    print(before, after)
+    assert after < 0.25 * before
+
+    def log_density(rate, z):
+        law = nb.DiffusionEndpoint(nb.LinearSDE(-rate, 0.5), x0, match, t1=1.0, num_steps=10, guide=score)
+
+        def model():
+            numpyro.factor("fixed", 0.0)
+            numpyro.sample("seen", law.given(z), obs=jnp.array([0.2]))
+
+        return numpyro.infer.util.log_density(model, (), {}, {})[0]
+
+    z = jr.normal(jr.key(4), (10, 1, 1))
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        found = jax.jit(log_density)(1.7, z)
+        bridge = nb.GuidedBridge(nb.LinearSDE(-1.7, 0.5), match.at([0.2]), x0=x0, t1=1.0, num_steps=10, guide=score)
+        np.testing.assert_allclose(found, bridge.log_weight(z), rtol=1e-10)
+
+
+def sine_evidence(ts, v=np.pi / 2):
+    """Of the Euler model on the grid, by quadrature."""
+    grid = np.linspace(-2.5, 4.0, 1300)
+
+    def step(x, y, dt):
+        return scipy.stats.norm.pdf(y, x + dt * (2 - 2 * np.sin(8 * x)), 0.5 * np.sqrt(dt))
+
+    h, dts = step(grid, v, ts[-1] - ts[-2]), np.diff(ts)
+    for dt in dts[-2:0:-1]:
+        h = step(grid[:, None], grid[None], dt) @ h * (grid[1] - grid[0])
+    return np.log(np.sum(step(0.0, grid, dts[0]) * h) * (grid[1] - grid[0]))
+
+
+@pytest.mark.parametrize("method", ["residual", "adjoint", "reversal"])
+def test_the_sine_bridge(method):
+    """A multimodal bridge, where a Brownian guide has an ESS of 0.6 %: twenty times that, and the evidence within 3 SE."""
+    match = nb.ExactMatch().at([np.pi / 2])
+    guide = nb.FrozenGuide(nb.BrownianMotion(0.25))
+    score = nb.scores.fit(
+        SINE,
+        match,
+        x0=[0.0],
+        t1=1.0,
+        num_steps=40,
+        key=jr.key(0),
+        method=method,
+        guide=guide,
+        network=nb.scores.MLP((1, 1), key=jr.key(1), width=24, depth=2),
+        training=nb.scores.Training(300, 64, learning_rate=1e-2, interval=150),
+        progress=False,
+    )
+    bridge = nb.GuidedBridge(SINE, match, x0=[0.0], t1=1.0, num_steps=40, guide=guide)
+    z = jr.normal(jr.key(2), (4000, *bridge.noise_shape))
+    plain, log_weight = (np.asarray(jax.jit(jax.vmap(b.log_weight))(z)) for b in (bridge, bridge.with_guide(score)))
+    truth = sine_evidence(np.asarray(bridge.ts))
+    assert abs(truth + 0.2610) < 0.02  # the Euler model of 40 steps and the diffusion
+    weight = np.exp(log_weight - truth)
+    error = weight.std() / np.sqrt(len(weight))
+    ess = [float(nb.weights.effective_sample_size(w)) for w in (plain, log_weight)]
+    print(method, truth, weight.mean(), error, ess, score.history["bound"])
+    assert error < 0.1 and abs(weight.mean() - 1) < 3 * error
+    assert ess[1] > 20 * ess[0]
