@@ -82,7 +82,7 @@ def fit(
     - `draw`: `draw(key)` gives `(sde, condition, x0)` like those given, for a guide that serves many of them: other
       parameters, targets or starts. `context(sde)`, `(c,)`, are the parameters that the network is told; it is always
       told the target.
-    - `directory`: where training is saved at each look; the same call resumes from there.
+    - `directory`: where training is saved at each look; the same call resumes from there, and another is refused.
     - `progress`: show a bar with the loss, the evidence bound and the ESS on held-out paths.
 
     **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
@@ -117,7 +117,7 @@ def fit(
         draw is not None,
         _untrained(network, draw_bridge, context, key_pilot),
         training,
-        partial(_train, directory=None if directory is None else Path(directory), progress=progress),
+        partial(_train, given=bridge, directory=None if directory is None else Path(directory), progress=progress),
     )
     return METHODS[method](problem, key_train)
 
@@ -214,10 +214,18 @@ def _driftless(bridge: GuidedBridge) -> AbstractGuide:
 METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
 
 
-def _train(problem: Problem, loss, judge, key, name, *, directory, progress) -> ScoreGuide:
+def _train(problem: Problem, loss, judge, key, name, *, given, directory, progress) -> ScoreGuide:
     file = None if directory is None else directory / f"{name.replace(' ', '_')}.eqx"
     network, history = train(
-        problem.guide.network, loss, judge, key, problem.training, name=name, file=file, progress=progress
+        problem.guide.network,
+        loss,
+        judge,
+        key,
+        problem.training,
+        name=name,
+        file=file,
+        problem=(given, problem.guide.standard),
+        progress=progress,
     )
     guide = _with_network(problem.guide, network)
     return ScoreGuide(guide.guide, network, guide.standard, guide.context, history)
@@ -283,7 +291,7 @@ def _regression(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray)
 
 
 def _judge(problem: Problem, key: PRNGKeyArray):
-    """E log w, and the ESS fraction, on held-out paths."""
+    """E log w, and the ESS fraction, on held-out paths. Weights that do not vary are a perfect guide's: value ∞."""
     draws = 16 if problem.amortised else 1
     size = -(-problem.training.held_out // draws)
 
@@ -293,10 +301,14 @@ def _judge(problem: Problem, key: PRNGKeyArray):
             bridge = problem.draw(key_draw).with_guide(_with_network(problem.guide, network))
             noise = jr.normal(key_noise, (size, *bridge.noise_shape), bridge.x0.dtype)
             log_weights = jax.vmap(bridge.log_weight)(noise)
-            return jnp.mean(log_weights), weights.effective_sample_size(log_weights) / size
+            ess = weights.effective_sample_size(log_weights) / size
+            return jnp.mean(log_weights), ess, jnp.std(log_weights)
 
-        bound, ess = jax.tree.map(jnp.mean, jax.vmap(one)(jr.split(key, draws)))
+        bounds, ess, spread = jax.vmap(one)(jr.split(key, draws))
+        bound, ess = jnp.mean(bounds), jnp.mean(ess)
         value = jnp.where(jnp.isfinite(bound), bound, -jnp.inf)
+        perfect = (size > 1) & jnp.all(spread < jnp.sqrt(jnp.finfo(spread.dtype).eps))
+        value = jnp.where(perfect, jnp.inf, value)
         return value, bound, ess
 
     return judge
