@@ -51,8 +51,8 @@ def run_checkpointed(
         run_checkpointed(mcmc, "wings_run", jax.random.key(0), wings)  # and after a crash: the same line again
 
     The draws are, bit for bit, those of a run that was never cut off, given the same machine, devices and versions.
-    Afterwards `mcmc` is as after `run`. The same call with a larger `num_samples` makes a chain longer. With thinning by k,
-    draws k, 2k, ... after the warm-up are kept.
+    Afterwards `mcmc` is as after `run`. The same call with a larger `num_samples` makes a chain longer. With thinning
+    by k, draws k, 2k, ... after the warm-up are kept.
 
     **Arguments:**
 
