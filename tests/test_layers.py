@@ -29,7 +29,8 @@ LAYERS = [
     {"distributions"},
     {"infer"},
     {"io"},
-    {"datasets", "plot", "_compare"},
+    {"datasets", "plot"},
+    {"_compare"},
 ]
 LEVEL = {unit: level for level, units in enumerate(LAYERS) for unit in units}
 

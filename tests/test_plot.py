@@ -2,9 +2,11 @@
 
 import builtins
 
+import jax.random as jr
 import numpy as np
 import pytest
 
+import numpyro_bridges as nb
 from numpyro_bridges import datasets, plot
 
 matplotlib = pytest.importorskip("matplotlib", reason="matplotlib is not installed")
@@ -92,6 +94,87 @@ def test_score_field(shapes):
     quiver.figure.canvas.draw()
     assert np.all(quiver.axes.get_xlim()[1] >= (points + drawn)[:, 0].max())
     assert not plot.score_field(points, np.zeros((12, 2))).U.any()
+
+
+@pytest.fixture(scope="module")
+def flows(shapes):
+    """Bridges of the same shapes as landmarks and as coefficients, with a path each."""
+    start, target = shapes.points[0], shapes.points[3]
+    landmarks, basis = nb.Landmarks(12, 2), nb.FourierBasis(2, 2, num_quadrature=9)
+    kernel, match = nb.GaussianKernel(0.5, 0.5), nb.InexactMatch(1e-3)
+    bridges = {
+        "points": nb.GuidedBridge(
+            nb.KunitaFlow(landmarks, kernel), match.at(target), x0=start, ts=np.linspace(0.0, 2.0, 9)
+        ),
+        "series": nb.GuidedBridge(
+            nb.KunitaFlow(basis, kernel, noise="grid"),
+            match.at(basis.project(target)),
+            x0=basis.project(start),
+            ts=np.linspace(0.0, 2.0, 6),
+        ),
+    }
+    paths = {name: bridge.path(jr.normal(jr.key(0), bridge.noise_shape)) for name, bridge in bridges.items()}
+    return bridges, paths
+
+
+@pytest.mark.parametrize("scale", [None, 0.05])
+def test_score_frames(flows, shapes, tmp_path, scale):
+    bridges, paths = flows
+    quivers = plot.score_frames(bridges, paths, [0.0, 0.8, 1.9], tmp_path / "frames.png", scale=scale)
+    assert (tmp_path / "frames.png").stat().st_size > 0 and not plt.get_fignums()
+    drawn, lengths = [], []
+    for line, (name, bridge) in zip(quivers, bridges.items(), strict=True):
+        indices = {"points": [0, 3, 7], "series": [0, 2, 4]}[name]
+        for quiver, k in zip(line, indices, strict=True):
+            t, x = bridge.ts[k], paths[name][k]
+            field = np.asarray(bridge.sde.covariance(t, x)) @ np.asarray(bridge.score(t, x))
+            points, field = (np.asarray(bridge.sde.space.to_points(part)) for part in (x, field))
+            np.testing.assert_allclose(quiver.get_offsets(), points)
+            arrows = np.stack([quiver.U, quiver.V], axis=1)
+            drawn.append(np.linalg.norm(arrows) / np.linalg.norm(field))
+            lengths.append(np.linalg.norm(arrows, axis=1).max())
+            np.testing.assert_allclose(arrows, drawn[-1] * field, atol=1e-12)
+            assert quiver.axes.get_title() == f"$t = {t:.3g}$"
+            (x0, x1), (y0, y1) = quiver.axes.get_xlim(), quiver.axes.get_ylim()
+            corners = np.concatenate([points, points + arrows])
+            assert np.all(corners > [x0, y0]) and np.all(corners < [x1, y1])
+    np.testing.assert_allclose(drawn, drawn[0])  # one scale for all frames
+    extent = max(np.ptp(quiver.get_offsets(), axis=0).max() for line in quivers for quiver in line)
+    assert drawn[0] == pytest.approx(scale) if scale else max(lengths) == pytest.approx(extent / 3.0)
+    targets = [line[0].axes.collections[0].get_paths()[0].vertices[:-1] for line in quivers]
+    np.testing.assert_allclose(targets[0], shapes.points[3])
+    space = bridges["series"].sde.space
+    np.testing.assert_allclose(targets[1], space.to_points(bridges["series"].condition.observed))
+    assert "the drift that conditioning adds" in quivers[0][0].figure.get_supxlabel()
+    labels = [line[0].axes.texts[0].get_text() for line in quivers]
+    assert labels == list(bridges)
+
+
+def test_score_frames_of_one_bridge(flows, tmp_path):
+    """Guides on one path share its columns' titles; one bridge needs no name."""
+    (bridge, _), (path, _) = (part.values() for part in flows)
+    frozen = bridge.with_guide(nb.FrozenGuide())
+    alone = plot.score_frames(frozen, path, 0.5, tmp_path / "a.png")
+    pair = plot.score_frames({"receding": bridge, "frozen": frozen}, path, 0.5, tmp_path / "b.png")
+    assert [len(line) for line in alone] == [1] and [len(line) for line in pair] == [1, 1]
+    assert [line[0].axes.get_title() for line in pair] == ["$t = 0.5$", ""]
+    assert not np.allclose(pair[0][0].U, pair[1][0].U)
+
+
+def test_score_frames_errors(flows):
+    bridges, paths = flows
+    one, path = bridges["points"], paths["points"]
+    with pytest.raises(ValueError, match=r"`paths` must have the names of `bridges`, \['a'\]; got \['b'\]"):
+        plot.score_frames({"a": one}, {"b": path}, [0.0], "never.png")
+    with pytest.raises(ValueError, match=r"`paths` must have a state for each .*\(9, 12, 2\); got \(5, 12, 2\)"):
+        plot.score_frames(one, path[:5], [0.0], "never.png")
+    with pytest.raises(ValueError, match=r"`times` must lie in \[0.0, 2.0\), before the end; got \[2.\]"):
+        plot.score_frames(one, path, 2.0, "never.png")
+    line = nb.GuidedBridge(
+        nb.BrownianMotion(1.0), nb.InexactMatch(0.1).at([1.0, 2.0]), x0=[0.0, 1.0], t1=1.0, num_steps=2
+    )
+    with pytest.raises(ValueError, match=r"`points of paths` must have the shape \(T, q, 2\), got \(1, 2\)"):
+        plot.score_frames(line, np.zeros((3, 2)), 0.0, "never.png")
 
 
 def test_posterior():

@@ -5,4 +5,5 @@ The colours can be told apart by colour-blind readers (after Okabe & Ito); time 
 """
 
 from ._posterior import posterior as posterior
+from ._scores import score_frames as score_frames
 from ._shapes import bridge_fan as bridge_fan, outlines as outlines, path as path, score_field as score_field
