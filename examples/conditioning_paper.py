@@ -45,7 +45,7 @@ parser.add_argument("--labels", type=Path, help="a CSV table with a row for each
 parser.add_argument("--label", default="species", help="the column of that table")
 parser.add_argument("--id", default="id", help="the column of a CSV file that tells specimens apart")
 parser.add_argument("--points", type=int, default=32, help="landmarks of the bridges")
-parser.add_argument("--width", type=float, default=0.2, help="of the kernel, for the bridges")
+parser.add_argument("--width", type=float, default=0.1, help="of the kernel, for the bridges")
 parser.add_argument("--updates", type=int, default=150, help="of each training")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--output", type=Path, default=Path("output"))
@@ -54,7 +54,7 @@ quick = arguments.quick
 num_points, num_steps = (16, 20) if quick else (arguments.points, 50)
 num_particles = 256 if quick else 2048
 updates = 20 if quick else arguments.updates
-POINT_SD = 0.005  # of the observation, in units of the extent
+NOISE = 0.2  # SD of a point's observation, of the RMS distance between start and end
 arguments.output.mkdir(parents=True, exist_ok=True)
 keys = dict(zip(FIGURES, jr.split(jr.key(arguments.seed), len(FIGURES)), strict=True))
 numbers = {}
@@ -141,11 +141,11 @@ def rms(difference):
     return float(np.sqrt(np.mean(np.sum(np.asarray(difference) ** 2, axis=-1))))
 
 
-def learned(bridge, key, *, method="residual", network=None, draw=None):
+def learned(bridge, key, *, network=None, draw=None):
     training = nb.scores.Training(updates, 8 if quick else 16, interval=max(updates // 5, 1), held_out=128)
     if network is None and isinstance(bridge.sde.space, nb.Landmarks):
         network = nb.scores.PointNetwork(2, width=16, depth=1, key=key)
-    settings = {"method": method, "network": network, "training": training, "draw": draw, "progress": False}
+    settings = {"network": network, "training": training, "draw": draw, "progress": False}
     found = nb.scores.fit(
         bridge.sde, bridge.condition, x0=bridge.x0, ts=bridge.ts, key=key, guide=bridge.guide, **settings
     )
@@ -283,7 +283,8 @@ def outline():
 # ## Brownian motion between shapes
 # Q-Brownian motion with variances that fall with the frequency, the same process in both discretisations: N Fourier
 # coefficients, or the N points that they give. The default guide is exact here. Beside it, one that takes the noise to
-# be white, and a network that learns what this one lacks; ∇log h has a closed form, so the score's error is known.
+# be white, and for inexact matches a network that learns what this one lacks. ∇log h has a closed form, so the error of
+# each score is known.
 
 
 # %%
@@ -300,7 +301,7 @@ def brownian():
         "Fourier": nb.BrownianMotion(variances, space=basis),
         "landmarks": nb.BrownianMotion(values * variances @ values.T, space=points),
     }
-    matches = {"exact": nb.ExactMatch(), "inexact": nb.InexactMatch(POINT_SD**2 / n)}
+    matches = {"exact": nb.ExactMatch(), "inexact": nb.InexactMatch((NOISE * spread) ** 2 / n)}
     figure, axes = panels(2, 2, size=3.6, shape=start)
     found = {}
     for line, (kind, sde) in zip(axes, processes.items(), strict=True):
@@ -329,10 +330,10 @@ def brownian_row(name, bridge, v):
 
     white = bridge.with_guide(nb.FrozenGuide(nb.BrownianMotion(jnp.mean(jnp.diag(a)))))
     bridges = {"guided": bridge}
-    if not quick or name == "Fourier, inexact":
+    if not bridge.condition.exact and (not quick or name == "Fourier, inexact"):
         bridges["white guide"] = white
         network = nb.scores.MLP(bridge.x0.shape, key=keys["brownian"])
-        bridges["learned on it"] = learned(white, keys["brownian"], method="adjoint", network=network)
+        bridges["learned on it"] = learned(white, keys["brownian"], network=network)
     return report("brownian", name, bridges, keys["brownian"], score=score).rows["guided"]["log_evidence"]
 
 
@@ -359,7 +360,8 @@ def bridge():
     start, end, names = transition()
     x0, v = landmarks(start), landmarks(end)
     space = nb.Landmarks(num_points, 2)
-    sde, seen = flow(space, arguments.width, sd=rms(v - x0)), nb.InexactMatch.from_point_sd(POINT_SD, space)
+    spread = rms(v - x0)
+    sde, seen = flow(space, arguments.width, sd=spread), nb.InexactMatch.from_point_sd(NOISE * spread, space)
     guided = nb.GuidedBridge(sde, seen.at(v), x0=x0, t1=1.0, num_steps=num_steps)
     bridges = {"guided": guided, "learned": learned(guided, keys["bridge"])}
     comparison = report("bridge", f"{names[0]} to {names[1]}", bridges, keys["bridge"])
@@ -398,7 +400,8 @@ def species():
     mean, ends = one_of_each()
     x0, targets = landmarks(mean), jnp.stack([landmarks(end) for end in ends.values()])
     space = nb.Landmarks(num_points, 2)
-    sde, seen = flow(space, arguments.width, sd=rms(targets - x0)), nb.InexactMatch.from_point_sd(POINT_SD, space)
+    spread = rms(targets - x0)
+    sde, seen = flow(space, arguments.width, sd=spread), nb.InexactMatch.from_point_sd(NOISE * spread, space)
 
     def draw(key):
         return sde, seen.at(targets[jr.randint(key, (), 0, len(targets))]), x0
@@ -432,12 +435,12 @@ def species():
 # %%
 def scores():
     start, end, names = transition()
-    bridges, paths = {}, {}
+    bridges, paths, spread = {}, {}, rms(end - start)
     for m in (2, 4) if quick else (4, 8, 12):
         space = nb.FourierBasis(m, 2)
         x0, v = start_state(space, start), start_state(space, end)
-        sde = flow(space, arguments.width, sd=rms(v - x0) * np.sqrt(space.size))
-        seen = nb.InexactMatch(POINT_SD**2 / space.size)
+        sde = flow(space, arguments.width, sd=spread)
+        seen = nb.InexactMatch((NOISE * spread) ** 2 / space.size)
         guided = nb.GuidedBridge(sde, seen.at(v), x0=x0, t1=1.0, num_steps=num_steps)
         found = {"guided": guided}
         if not quick:

@@ -34,7 +34,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--quick", action="store_true", help="16 points, 30 steps, few updates and draws")
+parser.add_argument("--quick", action="store_true", help="16 points, 30 steps, two trainings, few updates and draws")
 parser.add_argument("--updates", type=int, default=150, help="of each training")
 parser.add_argument("--draws", type=int, default=150, help="of each of 4 chains, in each of two runs")
 parser.add_argument("--seed", type=int, default=0)
@@ -42,10 +42,10 @@ parser.add_argument("--output", type=Path, default=Path("output"))
 arguments, _ = parser.parse_known_args()
 quick = arguments.quick
 num_points, num_steps = (16, 30) if quick else (32, 50)
-num_particles = 256 if quick else 2048
-num_warmup, num_draws = (20, 20) if quick else (100, arguments.draws)
+num_particles = 128 if quick else 2048
+num_warmup, num_draws = (10, 15) if quick else (100, arguments.draws)
 if quick:
-    training = nb.scores.Training(20, 8, interval=10, held_out=64)
+    training = nb.scores.Training(10, 4, interval=5, held_out=32)
 else:
     training = nb.scores.Training(arguments.updates, 16, interval=max(arguments.updates // 10, 1), held_out=256)
 arguments.output.mkdir(parents=True, exist_ok=True)
@@ -89,7 +89,8 @@ def learn(method):
     return nb.scores.fit(bridge.sde, seen.at(wing), key=key_fit, method=method, network=network, **settings)
 
 
-guides = {method: learn(method) for method in ("residual", "adjoint", "reversal")}
+methods = ("residual", "adjoint") if quick else ("residual", "adjoint", "reversal")
+guides = {method: learn(method) for method in methods}
 bridges = {"guided": bridge} | {method: bridge.with_guide(guide) for method, guide in guides.items()}
 comparison = nb.compare(bridges, key_compare, num_particles=num_particles)
 print(comparison)
@@ -103,7 +104,7 @@ print(comparison)
 def plot_training(histories):
     _, axes = plt.subplots(1, 2, figsize=(8.0, 3.0), layout="constrained")
     log_evidence = comparison.rows["guided"]["log_evidence"]
-    for (method, history), color in zip(histories.items(), ("#003f5c", "#d55e00", "#0072b2"), strict=True):
+    for (method, history), color in zip(histories.items(), ("#003f5c", "#d55e00", "#0072b2"), strict=False):
         style = {"color": color, "marker": "o", "markersize": 3, "linewidth": 1.2, "label": method}
         axes[0].plot(history["seconds"], history["bound"], **style)
         axes[1].plot(history["seconds"], 100 * history["ess"], **style)
@@ -175,7 +176,7 @@ def model(guide, observed):
 
 def run(guide, key):
     """Draws of two runs of the same compiled program, and the seconds of the second: no compilation is in them."""
-    kernel = nb.infer.FunctionSpaceHMC(lambda observed: model(guide, observed))
+    kernel = nb.infer.FunctionSpaceHMC(lambda observed: model(guide, observed), max_num_steps=4 if quick else 16)
     mcmc = MCMC(
         kernel,
         num_warmup=num_warmup,
