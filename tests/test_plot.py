@@ -170,6 +170,8 @@ def test_score_frames_errors(flows):
         plot.score_frames(one, path[:5], [0.0], "never.png")
     with pytest.raises(ValueError, match=r"`times` must lie in \[0.0, 2.0\), before the end; got \[2.\]"):
         plot.score_frames(one, path, 2.0, "never.png")
+    with pytest.raises(ValueError, match="`paths` must lead to finite drifts"):
+        plot.score_frames(one, np.asarray(path) * np.nan, 0.0, "never.png")
     line = nb.GuidedBridge(
         nb.BrownianMotion(1.0), nb.InexactMatch(0.1).at([1.0, 2.0]), x0=[0.0, 1.0], t1=1.0, num_steps=2
     )

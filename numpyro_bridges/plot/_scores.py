@@ -49,20 +49,18 @@ def score_frames(
     if set(paths) != set(bridges):
         raise ValueError(f"`paths` must have the names of `bridges`, {list(bridges)}; got {list(paths)}.")
     rows = {name: _Row(bridge, paths[name], times) for name, bridge in bridges.items()}
-    if scale is None:
-        longest = max(np.linalg.norm(row.drifts, axis=-1).max() for row in rows.values())
-        scale = max(np.ptp(row.points, axis=1).max() for row in rows.values()) / (3.0 * longest if longest > 0 else 1.0)
-    corners = np.concatenate([row.corners(scale) for row in rows.values()])
+    length = _default_scale(list(rows.values())) if scale is None else scale
+    corners = np.concatenate([row.corners(length) for row in rows.values()])
     figure, axes = _canvas(len(rows), len(np.atleast_1d(times)), corners)
     first = next(iter(rows.values())).times
     drawn = []
     for line, (name, row) in zip(axes, rows.items(), strict=True):
-        drawn.append([row.draw(ax, i, scale, closed) for i, ax in enumerate(line)])
+        drawn.append([row.draw(ax, i, length, closed) for i, ax in enumerate(line)])
         line[0].text(-0.04, 0.5, name, transform=line[0].transAxes, rotation=90, ha="right", va="center")
         if row.times is first or not np.allclose(row.times, first):
             for ax, time in zip(line, row.times, strict=True):
                 ax.set_title(f"$t = {time:.3g}$", fontsize=10)
-    words = f"arrows: $a\\,s$, the drift that conditioning adds, × {scale:.2g} time units; grey: the target"
+    words = f"arrows: $a\\,s$, the drift that conditioning adds, × {length:.2g} time units; grey: the target"
     figure.supxlabel(words, fontsize=9)
     figure.savefig(file, dpi=150)
     pyplot().close(figure)
@@ -80,6 +78,8 @@ class _Row:
         self.points = as_points(jax.vmap(to_points)(states[chosen]), "points of paths", "(T, q, 2)")
         drifts = _guiding_drift(bridge, bridge.ts[chosen], states[chosen])
         self.drifts = np.asarray(jax.vmap(to_points)(drifts), dtype=float)
+        if not np.isfinite(self.drifts).all():
+            raise ValueError("`paths` must lead to finite drifts a(t, x) ∇ log h̃(t, x); got NaN or infinite ones.")
         self.target = np.asarray(to_points(bridge.condition.reference(bridge.sde, states[-1])), dtype=float)
 
     def corners(self, scale: float) -> NDArray:
@@ -93,6 +93,12 @@ class _Row:
         arrows = score_field(self.points[i], self.drifts[i], ax, length=scale * longest, closed=closed, width=0.007)
         ax.axis(limits)
         return arrows
+
+
+def _default_scale(rows: list[_Row]) -> float:
+    """The longest arrow is a third of the largest extent; 0 where there is no drift."""
+    longest = max(np.linalg.norm(row.drifts, axis=-1).max() for row in rows)
+    return float(max(np.ptp(row.points, axis=1).max() for row in rows) / (3 * longest)) if longest > 0 else 0.0
 
 
 def _states(bridge: GuidedBridge, path: ArrayLike) -> jax.Array:
