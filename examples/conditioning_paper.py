@@ -379,13 +379,13 @@ def bridge():
 def draw_bridge(paths, x0, name, words):
     figure, axes = panels(1, 2, size=4.5, shape=x0)
     lines = nb.plot.path(paths[0], axes[0, 0], num_outlines=8)
-    axes[0, 0].set_title(f"one path, {name}", fontsize=9)
+    axes[0, 0].set_title("one path", fontsize=9)
     nb.plot.path(paths[:20].mean(0), axes[0, 1], num_outlines=5, trajectories=False)
     for i in range(0, num_points, num_points // 8):
         axes[0, 1].plot(*paths[:20, :, i].T, color="#8a8a8a", linewidth=0.4, alpha=0.6, zorder=1)
         axes[0, 1].plot(*paths[:20, :, i].mean(0).T, color="#d55e00", linewidth=1.4, zorder=3)
     axes[0, 1].set_title("20 paths of 8 points, and their mean", fontsize=9)
-    figure.suptitle(words, fontsize=9)
+    figure.suptitle(f"{name}; {words}" if words else name, fontsize=9)
     figure.colorbar(lines, ax=axes, label="time", shrink=0.8)
     save("bridge.png")
 

@@ -43,7 +43,7 @@ arguments, _ = parser.parse_known_args()
 quick = arguments.quick
 num_points, num_steps = (16, 30) if quick else (32, 50)
 num_particles = 128 if quick else 2048
-num_warmup, num_draws = (10, 15) if quick else (100, arguments.draws)
+num_warmup, num_draws = (6, 10) if quick else (100, arguments.draws)
 if quick:
     training = nb.scores.Training(10, 4, interval=5, held_out=32)
 else:
