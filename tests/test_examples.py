@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import numpyro_bridges as nb
+
 ROOT = Path(__file__).parent.parent
 # One thread, and programs that are compiled quickly: they run once.
 ENVIRONMENT = os.environ | {
@@ -51,6 +53,41 @@ def test_mosquito_wings(tmp_path):
     assert "r_hat" in out and "divergences: 0" in out
     for name in ("wings.nc", "bridges.png", "posterior.png", "score.png"):
         assert (tmp_path / "output" / name).stat().st_size > 5000
+
+
+def test_learned_vs_guided(tmp_path):
+    pytest.importorskip("ktch")
+    pytest.importorskip("matplotlib")
+    run(str(ROOT / "examples/learned_vs_guided.py"), "--quick", "--output", "output", cwd=tmp_path)
+    found = json.loads((tmp_path / "output/learned_vs_guided.json").read_text())
+    rows = found["comparison"]
+    assert list(rows) == ["guided", "residual", "adjoint"]
+    for row in rows.values():
+        joint = (row["standard_error"] ** 2 + rows["guided"]["standard_error"] ** 2) ** 0.5
+        assert abs(row["log_evidence"] - rows["guided"]["log_evidence"]) < 4 * joint + 1e-3, row
+    # A check that all runs: so few draws have Monte Carlo errors that are themselves badly known.
+    assert all(abs(z) < 6 for row in found["difference_in_errors"].values() for z in row.values()), found
+    for name in ("training.png", "comparison.png", "posteriors.png"):
+        assert (tmp_path / "output" / name).stat().st_size > 5000
+
+
+def test_conditioning_paper(tmp_path):
+    pytest.importorskip("ktch")
+    pytest.importorskip("matplotlib")
+    run(str(ROOT / "examples/conditioning_paper.py"), "--quick", "--output", "output", cwd=tmp_path)
+    found = json.loads((tmp_path / "output/conditioning_paper.json").read_text())
+    assert abs(found["brownian"]["exact: gap of the discretisations"]) < 1e-3
+    for name in ("circles", "outline", "brownian", "bridge", "bridge_times", "species", "scores"):
+        assert (tmp_path / "output" / f"{name}.png").stat().st_size > 5000
+
+
+def test_conditioning_paper_reads_files(tmp_path):
+    pytest.importorskip("matplotlib")
+    ellipses = nb.datasets.ellipses(num_points=48, aspects=(1.0, 1.5))
+    nb.io.write_csv(tmp_path / "start.csv", [nb.io.Specimen(ellipses.points[0])])
+    nb.io.write_tps(tmp_path / "end.tps", [nb.io.Specimen(ellipses.points[1])])
+    chosen = "--quick --figures outline --start start.csv --end end.tps --output output".split()
+    assert "RMS displacement" in run(str(ROOT / "examples/conditioning_paper.py"), *chosen, cwd=tmp_path)
 
 
 def test_calibration(tmp_path):
