@@ -129,12 +129,17 @@ class Condition:
 
 @dataclass(frozen=True)
 class Guide:
-    """`auxiliary` None: linearised at the reference. `receding`: the weight of the end, or None if frozen."""
+    """`auxiliary` None: linearised at the reference. `receding`: the weight of the end, or None if frozen.
+
+    `learned(t, x, reference, ts)` is what a network adds to the score.
+    """
 
     auxiliary: Process | None = None
     receding: float | None = None
     euler: bool = False
     dense: bool = True
+    unguided: bool = False
+    learned: Callable | None = None
 
 
 @dataclass(frozen=True)
@@ -157,6 +162,8 @@ class Problem:
         """Λ, s, M: what the guide, at x_now at step k_now, forecasts of v from the state at step k."""
         reference, L = self.reference(), self.condition.L
         n = L.shape[1]
+        if self.guide.unguided:
+            return 0 * L, np.zeros((L.shape[0], self.x0.shape[1])), np.eye(len(L))
         Lam, s = L, np.zeros((L.shape[0], self.x0.shape[1]))
         M = np.zeros((len(L), len(L))) if self.condition.noise is None else self.condition.noise
         weight = self.guide.receding
@@ -195,6 +202,8 @@ class Problem:
             mu, cov, B, total = conditional(sigma, m, Lam, s, M, v, exact=last and condition.noise is None)
             if self.guide.euler and not last:
                 B, cov = np.eye(len(B)), np.eye(len(B))
+            if self.guide.learned is not None and not last:
+                mu = mu + B @ sigma.T @ self.guide.learned(ts[k], x, self.reference(), ts)
             u = mu + B @ z[extra + k]
             x = m + sigma @ u
             path.append(x)

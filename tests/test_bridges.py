@@ -4,6 +4,7 @@ log weight = log p(path) + log p(v | x_K) − log q(path).
 """
 
 import itertools
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ from helpers import Condition, Guide, Problem, Process, check_bridge, columns, l
 from models import CONSTANT, CURVED, SDES, X3, Q, R, W
 
 import numpyro_bridges as nb
+from numpyro_bridges.guiding._score import Standard
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
@@ -117,7 +119,34 @@ GUIDES = {
     "receding-mixed": (lambda: nb.RecedingGuide(end_weight=0.2), Guide(receding=0.2)),
     "drift": (lambda: nb.DriftGuide(nb.FrozenGuide()), Guide(euler=True)),
     "drift-receding": (lambda: nb.DriftGuide(nb.RecedingGuide()), Guide(euler=True, receding=0.0)),
+    "unguided": (nb.scores.Unguided, Guide(unguided=True)),
+    "learned": (lambda: learned(nb.RecedingGuide()), Guide(receding=0.0)),
+    "learned-unguided": (lambda: learned(nb.scores.Unguided()), Guide(unguided=True)),
 }
+
+
+def learned(guide):
+    """A network that is no good, told the time, the displacement, the target and a parameter."""
+    standard = Standard(*(jnp.asarray(a) for a in (0.9, 0.8, 0.1, 0.7, np.array([0.2]), np.array([0.5]))))
+    return nb.scores.ScoreGuide(guide, output, standard, lambda sde: jnp.array([0.7]))
+
+
+def output(t, x, v, theta):
+    return theta[0] * (0.6 * jnp.cos(x + 2 * t) - 0.4 * v) + 0.3 * x[::-1]
+
+
+def network_score(sde, process):
+    """The network's output in its units, from numbers alone."""
+    weights = np.ones(3) if sde.space is None else np.asarray(sde.space.weights)
+    pooled = isinstance(sde.space, nb.Landmarks)
+
+    def score(t, x, v, ts):
+        a = np.sum(weights * np.diag(process.covariance(ts[-1], v))) / np.sum(weights)
+        shifted = v - (v.mean(0) if pooled else 0.1)
+        said = output(1 - (ts[-1] - t) / 0.9, (x - v) / 0.8, shifted / 0.7, np.array([1.0]))
+        return weights[:, None] * np.asarray(said) / np.sqrt(0.9 * a)
+
+    return score
 
 
 def problem(sde_name, condition_name, guide_name):
@@ -129,7 +158,9 @@ def problem(sde_name, condition_name, guide_name):
         exact_steps = process.linear is not None
         guide = Guide(auxiliary=linear_process(*AUX, 3, columns(x0).shape[1], exact=exact_steps))
     if sde_name in CONSTANT or sde_name == "user-time":
-        guide = Guide(guide.auxiliary, None, guide.euler)  # the receding guide of a constant covariance is frozen
+        guide = replace(guide, receding=None)  # the receding guide of a constant covariance is frozen
+    if guide_name.startswith("learned"):
+        guide = replace(guide, learned=network_score(sde, process))
     bridge = nb.GuidedBridge(sde, condition, x0=x0, ts=TS, guide=make())
     return bridge, Problem(process, truth, guide, columns(x0), TS)
 
@@ -142,7 +173,7 @@ def rotate(names, *choices):
 @pytest.mark.parametrize(
     "sde, condition, guide",
     rotate(CONSTANT, ["inexact", "exact", "inexact-mask", "exact-operator"], ["frozen", "auxiliary", "receding"])
-    + [("BM-matrix", "inexact-operator", "drift")],
+    + [("BM-matrix", "inexact-operator", "drift"), ("linear-hypoelliptic", "inexact", "learned")],
 )
 def test_constant_covariance(sde, condition, guide, key):
     check_bridge(*problem(sde, condition, guide), key, compiled=True, inverse=sde != "linear-matrix")

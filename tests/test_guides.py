@@ -15,15 +15,20 @@ import scipy.stats
 from helpers import linear_process, log_normal
 
 import numpyro_bridges as nb
+from numpyro_bridges.guiding._score import Standard
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
+STANDARD = (1.0, 0.8, 0.0, 1.0, np.zeros(0), np.zeros(0))
 GUIDES = {
     "frozen": nb.FrozenGuide(),
     "auxiliary": nb.FrozenGuide(nb.LinearSDE(-0.3, 0.65, 0.1)),  # ã below a(v) = 0.41 would give heavy tails
     "receding": nb.RecedingGuide(),
     "receding-mixed": nb.RecedingGuide(end_weight=0.2),
     "drift": nb.DriftGuide(nb.FrozenGuide()),
+    "learned": nb.scores.ScoreGuide(
+        nb.FrozenGuide(), lambda t, x, v, theta: 0.3 * jnp.sin(3 * x) + 0.2 * t, Standard(*map(jnp.asarray, STANDARD))
+    ),
 }
 
 

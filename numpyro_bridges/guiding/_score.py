@@ -63,7 +63,7 @@ class Standard(eqx.Module):
 
     def target(self, v: State, pooled: bool) -> Float[Array, "n dim"]:
         """v̂."""
-        centre = jnp.mean(v, axis=0) if pooled else self.centre
+        centre = jnp.mean(v, axis=0, keepdims=True) if pooled else self.centre
         return (v - centre) / self.spread
 
 

@@ -180,5 +180,5 @@ def _coefficient(norm, weights, x, push, past) -> Float[Array, ""]:
 def _systematic(key, weights) -> Array:
     """Indices drawn in proportion to the weights, with one uniform number."""
     size = weights.shape[0]
-    points = (jr.uniform(key, (), weights.dtype) + jnp.arange(size)) / size
-    return jnp.clip(jnp.searchsorted(jnp.cumsum(weights), points), 0, size - 1)
+    points = (jr.uniform(key, (), weights.dtype) + jnp.arange(size, dtype=weights.dtype)) / size
+    return jnp.clip(jnp.searchsorted(jnp.cumsum(weights), points), 0, size - 1).astype(int)

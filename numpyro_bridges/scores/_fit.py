@@ -82,7 +82,7 @@ def fit(
     - `draw`: `draw(key)` gives `(sde, condition, x0)` like those given, for a guide that serves many of them: other
       parameters, targets or starts. `context(sde)`, `(c,)`, are the parameters that the network is told; it is always
       told the target.
-    - `directory`: where training is saved at each look; the same call resumes from there.
+    - `directory`: where training is saved at each look; the same call resumes from there, and another is refused.
     - `progress`: show a bar with the loss, the evidence bound and the ESS on held-out paths.
 
     **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
@@ -117,7 +117,7 @@ def fit(
         draw is not None,
         _untrained(network, draw_bridge, context, key_pilot),
         training,
-        partial(_train, directory=None if directory is None else Path(directory), progress=progress),
+        partial(_train, given=bridge, directory=None if directory is None else Path(directory), progress=progress),
     )
     return METHODS[method](problem, key_train)
 
@@ -214,10 +214,18 @@ def _driftless(bridge: GuidedBridge) -> AbstractGuide:
 METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
 
 
-def _train(problem: Problem, loss, judge, key, name, *, directory, progress) -> ScoreGuide:
+def _train(problem: Problem, loss, judge, key, name, *, given, directory, progress) -> ScoreGuide:
     file = None if directory is None else directory / f"{name.replace(' ', '_')}.eqx"
     network, history = train(
-        problem.guide.network, loss, judge, key, problem.training, name=name, file=file, progress=progress
+        problem.guide.network,
+        loss,
+        judge,
+        key,
+        problem.training,
+        name=name,
+        file=file,
+        problem=(given, problem.guide.standard),
+        progress=progress,
     )
     guide = _with_network(problem.guide, network)
     return ScoreGuide(guide.guide, network, guide.standard, guide.context, history)

@@ -72,7 +72,7 @@ class PointNetwork(eqx.Module):
     def __call__(self, t, x: State2, v: State2, theta: Float[Array, " c"]) -> State2:
         n = x.shape[0]
         square = jnp.sum((v[:, None] - v[None]) ** 2, -1)
-        near = jnp.exp(-0.5 * square * jnp.exp(-2 * self.log_widths.astype(x.dtype))[:, None, None]) / n
+        near = jnp.exp(-0.5 * square[None] * jnp.exp(-2 * self.log_widths.astype(x.dtype))[:, None, None]) / n
         time = jnp.concatenate([jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))]), time_features(t, 4), theta])
         shared = jnp.broadcast_to(time.astype(x.dtype), (n, time.shape[0]))
         h = jax.vmap(self.inner)(jnp.concatenate([x, v, shared], axis=1))

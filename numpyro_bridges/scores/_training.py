@@ -1,5 +1,7 @@
 """The training loop: whole chunks of updates on the device, an average of the iterates, the best of which is kept."""
 
+import hashlib
+import json
 import os
 import time
 import warnings
@@ -107,13 +109,15 @@ def train(
     *,
     name: str = "training",
     file: Path | None = None,
+    problem: Any = None,
     progress: bool = True,
 ) -> tuple[Any, dict[str, Array]]:
     """The best network, and the history.
 
     `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)` a value
     to be maximised, the bound and the ESS fraction on held-out paths. Update i uses `fold_in(key, i)`: the same key
-    gives the same network, however often training is resumed from `file`.
+    gives the same network, however often training is resumed from `file`, which is refused where it was written for
+    another `problem` (a pytree of arrays), another key or other settings.
     """
     optimizer, decay = training.optimizer, training.average
     judge = eqx.filter_jit(judge)
@@ -141,8 +145,9 @@ def train(
                 return loss_value, eqx.filter(renewed, eqx.is_inexact_array)
 
             (batch_loss, renewed), gradient = jax.value_and_grad(value, has_aux=True)(arrays)
-            steps, memory = optimizer.update(gradient, memory, renewed)
-            arrays = optax.apply_updates(renewed, steps)
+            with jax.numpy_dtype_promotion("standard"):  # optax needs it
+                steps, memory = optimizer.update(gradient, memory, renewed)
+                arrays = optax.apply_updates(renewed, steps)
             average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, average, arrays)
             return (arrays, average, memory), batch_loss
 
@@ -154,9 +159,9 @@ def train(
 
     def look(state: _State, loss_value, seconds) -> _State:
         value, bound, ess = judge(eqx.combine(state.average, static))
-        better = bool(value > state.best_value) or training.patience is None
+        better = bool(value > state.best_value) or (training.patience is None and bool(jnp.isfinite(value)))
         i = int(state.update) // training.interval
-        row = {"update": state.update, "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
+        row = {"update": float(state.update), "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
         return eqx.tree_at(
             lambda s: (s.best, s.best_value, s.waited, s.history),
             state,
@@ -168,8 +173,9 @@ def train(
             ),
         )
 
+    label = _label(name, problem, arrays, key, training)
     if file is not None and file.exists():
-        state = eqx.tree_deserialise_leaves(file, state)
+        state = _load(file, state, label)
     else:
         state = look(state, jnp.nan, 0.0)
     spent = float(np.nanmax(np.asarray(state.history["seconds"])))
@@ -188,7 +194,7 @@ def train(
             spent += time.perf_counter() - begin
             state = look(new, jnp.mean(losses), spent)
             if file is not None:
-                _save(file, state)
+                _save(file, state, label)
             row = {k: float(v[int(state.update) // training.interval]) for k, v in state.history.items()}
             bar.set_postfix_str(f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %")
             bar.update(training.interval)
@@ -200,9 +206,43 @@ def _stopped(state: _State, training: Training) -> bool:
     return training.patience is not None and int(state.waited) >= training.patience
 
 
-def _save(file: Path, state: _State) -> None:
-    """Whole or not at all."""
+def _label(name: str, problem: Any, network: Any, key: PRNGKeyArray, training: Training) -> dict[str, Any]:
+    """What a saved training belongs to. An optimizer is known by the shape of its state only."""
+    settings = {k: v for k, v in vars(training).items() if k != "optimizer"}
+    label = {"method": name, "problem": _digest(problem), "network": _digest(network), "key": _digest(key)}
+    return label | {f"training.{k}": v for k, v in settings.items()}
+
+
+def _digest(tree: Any) -> str:
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        if eqx.is_array_like(leaf):
+            is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+            value = np.asarray(jr.key_data(leaf) if is_key else leaf)
+            digest.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
+    return digest.hexdigest()
+
+
+def _save(file: Path, state: _State, label: dict[str, Any]) -> None:
+    """Whole or not at all: a line that says whose it is, and the leaves."""
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(".part")
-    eqx.tree_serialise_leaves(part, state)
+    with open(part, "wb") as f:
+        f.write(json.dumps(label).encode() + b"\n")
+        eqx.tree_serialise_leaves(f, state)
     os.replace(part, file)
+
+
+def _load(file: Path, state: _State, label: dict[str, Any]) -> _State:
+    with open(file, "rb") as f:
+        try:
+            saved = json.loads(f.readline())
+        except ValueError:
+            saved = {}
+        other = [k for k in label if saved.get(k) != label[k]]
+        require(
+            not other,
+            f"`directory` holds the training of something else: {file} differs in {', '.join(other)}. Repeat the call "
+            "that began it, or give another directory.",
+        )
+        return eqx.tree_deserialise_leaves(f, state)
