@@ -1,4 +1,10 @@
 from ..guiding import ScoreGuide as ScoreGuide, Unguided as Unguided
 from ._fit import fit as fit
-from ._networks import MLP as MLP, PointNetwork as PointNetwork, UNet as UNet, WithState as WithState
+from ._networks import (
+    MLP as MLP,
+    PointNetwork as PointNetwork,
+    Singular as Singular,
+    UNet as UNet,
+    WithState as WithState,
+)
 from ._training import Training as Training

@@ -27,7 +27,7 @@ from ..guiding import AbstractGuide, FrozenGuide, ScoreGuide, Standard, Unguided
 from ..sdes import AbstractSDE, BrownianMotion
 from ..spaces import Landmarks
 from ._clouds import Cloud, adjoint_cloud, forward_cloud, reversal_cloud, reversed_bridge, whiten
-from ._networks import MLP, PointNetwork, over_batch
+from ._networks import MLP, ROWWISE, PointNetwork, over_batch
 from ._training import Training, train
 
 Draw = Callable[[PRNGKeyArray], tuple[AbstractSDE, AbstractCondition, State]]
@@ -62,6 +62,7 @@ def fit(
     context: Callable[[Any], Array] | None = None,
     directory: str | Path | None = None,
     progress: bool = True,
+    watch: Callable[[str, ScoreGuide], None] | None = None,
 ) -> ScoreGuide:
     """Trains a network that corrects a guide, so that guide and network together are ∇log h.
 
@@ -84,6 +85,8 @@ def fit(
       told the target.
     - `directory`: where training is saved at each look; the same call resumes from there, and another is refused.
     - `progress`: show a bar with the loss, the evidence bound and the ESS on held-out paths.
+    - `watch`: `watch(name, guide)` is called at each look, with the guide as it then is and the history so far; `name`
+      is the method's, or `"time reversal"` in the first pass of `"reversal"`.
 
     **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
     training with a warning.
@@ -117,7 +120,13 @@ def fit(
         draw is not None,
         _untrained(network, draw_bridge, context, key_pilot),
         training,
-        partial(_train, given=bridge, directory=None if directory is None else Path(directory), progress=progress),
+        partial(
+            _train,
+            given=bridge,
+            directory=None if directory is None else Path(directory),
+            progress=progress,
+            watch=watch,
+        ),
     )
     return METHODS[method](problem, key_train)
 
@@ -214,7 +223,11 @@ def _driftless(bridge: GuidedBridge) -> AbstractGuide:
 METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
 
 
-def _train(problem: Problem, loss, judge, key, name, *, given, directory, progress) -> ScoreGuide:
+def _train(problem: Problem, loss, judge, key, name, *, given, directory, progress, watch) -> ScoreGuide:
+    def guide(network, history):
+        base = problem.guide
+        return ScoreGuide(base.guide, network, base.standard, base.context, history)
+
     file = None if directory is None else directory / f"{name.replace(' ', '_')}.eqx"
     network, history = train(
         problem.guide.network,
@@ -226,9 +239,9 @@ def _train(problem: Problem, loss, judge, key, name, *, given, directory, progre
         file=file,
         problem=(given, problem.guide.standard),
         progress=progress,
+        watch=None if watch is None else lambda network, history: watch(name, guide(network, history)),
     )
-    guide = _with_network(problem.guide, network)
-    return ScoreGuide(guide.guide, network, guide.standard, guide.context, history)
+    return guide(network, history)
 
 
 def _with_network(guide: ScoreGuide, network, held=None) -> ScoreGuide:
@@ -262,7 +275,8 @@ def _regression(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray)
 
         each = jax.vmap(jax.vmap(lacking, (None, None, 0, 0)))
         target = each(plan.steps, bridge.ts[:-1], cloud.x, cloud.score)
-        inputs = jax.vmap(jax.vmap(plan.inputs, (None, 0)))(plan.steps[1], cloud.x)
+        each_inputs = jax.vmap(plan.inputs, (None, 0), ROWWISE)
+        inputs = jax.vmap(each_inputs, (0, 0), ROWWISE)(plan.steps[1], cloud.x)
 
         def error(output):
             def one(t, x, f, target):
@@ -277,13 +291,13 @@ def _regression(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray)
     def loss(network, key):
         if draws == 1:
             inputs, error = rows(network, key)
-            flat = jax.tree.map(lambda a: a.reshape(a.shape[0] * a.shape[1], *a.shape[2:]), inputs)
-            output, network = over_batch(network, flat)
-            return error(output.reshape(*inputs[0].shape, *output.shape[1:])), network
+            t, x, *fixed = inputs
+            output, network = over_batch(network, t.ravel(), x.reshape(t.size, *x.shape[2:]), *fixed)
+            return error(output.reshape(*t.shape, *output.shape[1:])), network
 
         def one(key):
             inputs, error = rows(network, key)
-            return error(jax.vmap(jax.vmap(network))(*inputs))
+            return error(jax.vmap(jax.vmap(network, ROWWISE), ROWWISE)(*inputs))
 
         return jnp.mean(jax.vmap(one)(jr.split(key, draws))), network
 

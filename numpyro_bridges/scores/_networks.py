@@ -1,4 +1,4 @@
-"""Networks `network(t, x, v, theta)`: `ScoreGuide` says what they are given. All but `UNet` start at zero."""
+"""Networks `network(t, x, v, theta)`: `ScoreGuide` says what they are given. Ours start at zero, `UNet` does not."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -82,35 +82,63 @@ class PointNetwork(eqx.Module):
         return jax.vmap(self.outer)(h)
 
 
+class Singular(eqx.Module):
+    """Another network, preconditioned for a score that is singular near the end; for `guide=Unguided()`.
+
+    With l = √(1 − t + softness) the output is (network(t, x/l, v, θ) + g(t) x/l) / l, g a learned function of the time.
+    Near an observed end ∇log h is −a⁻¹(x − v)/(1 − t) up to smaller terms, and x − v is of size √(1 − t): what is
+    learned is then of size 1 at all times.
+
+    **Arguments:** `network`: as for `ScoreGuide`. `softness`: the part of the duration, before the end, in which l
+    stops shrinking: where the grid's last steps are short, or the observation's noise is known.
+    """
+
+    network: Any
+    gain: eqx.nn.MLP
+    softness: float = eqx.field(static=True)
+
+    def __init__(self, network: Any, *, key: PRNGKeyArray, softness: float = 0.0):
+        gain = eqx.nn.MLP(10, "scalar", 16, 1, jax.nn.silu, key=key)
+        self.gain = eqx.tree_at(lambda m: m.layers[-1], gain, replace_fn=_zero)
+        self.network, self.softness = network, softness
+
+    def __call__(self, t, x: State2, v: State2, theta: Float[Array, " c"]) -> State2:
+        length = jnp.sqrt(jnp.maximum(1 - t, 0) + self.softness)
+        y = x / length
+        time = jnp.concatenate([jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))]), time_features(t, 4)])
+        return (self.network(t, y, v, theta) + self.gain(time.astype(x.dtype)) * y) / length
+
+
 class UNet(eqx.Module):
     """The fully connected U-net of Baker et al. (2024), appendix: time enters every level, batch normalisation.
 
-    Levels of two dense layers, down and up with skip connections, SiLU. Build it with `UNet.build(...)`, which returns
-    it `WithState`: batch normalisation keeps running means.
+    Levels of two dense layers, down and up with skip connections, SiLU; the time embedding scales and shifts the first
+    layer of a level, which is residual. Build it with `UNet.build(...)`, which returns it `WithState`: batch
+    normalisation keeps running means.
 
     **Arguments:** `shape`: of the state. `widths`: of the levels on the way down, `(8N, 4N, 2N, N)` in the paper.
-    `embedding`: size of the time embedding.
+    `embedding`: size of the time embedding, and of the first layer.
     """
 
     inner: eqx.nn.Linear
-    time: eqx.nn.MLP
     down: list["_Level"]
+    middle: eqx.nn.Linear
     up: list["_Level"]
     outer: eqx.nn.Linear
     embedding: int = eqx.field(static=True)
 
     def __init__(self, shape: tuple[int, int], widths: Sequence[int], embedding: int, *, key: PRNGKeyArray):
-        key_in, key_time, key_out, *keys = jr.split(key, 3 + 2 * len(widths))
+        key_in, key_middle, key_out, *keys = jr.split(key, 3 + 2 * len(widths))
         size, widths = int(np.prod(shape)), list(widths)
         self.embedding = embedding
-        self.inner = eqx.nn.Linear(size, widths[0], key=key_in)
-        self.time = eqx.nn.MLP(embedding, embedding, embedding, 1, jax.nn.silu, key=key_time)
-        ins = [widths[0], *widths[:-1]]
+        self.inner = _xavier(size, embedding, key_in)
+        ins = [embedding, *widths[:-1]]
         self.down = [_Level(a, b, embedding, key=k) for a, b, k in zip(ins, widths, keys[: len(widths)], strict=True)]
+        self.middle = _xavier(widths[-1], widths[-1], key_middle)
         back = widths[::-1]
         ins = [back[0], *back[:-1]]
         self.up = [_Level(a + b, b, embedding, key=k) for a, b, k in zip(ins, back, keys[len(widths) :], strict=True)]
-        self.outer = eqx.nn.Linear(widths[0], size, key=key_out)
+        self.outer = _xavier(widths[0], size, key_out)
 
     @classmethod
     def build(cls, shape, widths, embedding, *, key: PRNGKeyArray) -> "WithState":
@@ -125,19 +153,20 @@ class UNet(eqx.Module):
 
     def __call__(self, t, x, v, theta, state):
         half = self.embedding // 2
-        angles = 100.0 * t * jnp.asarray(10000.0 ** (-np.arange(half) / half), x.dtype)
-        time = self.time(jnp.concatenate([jnp.sin(angles), jnp.cos(angles)]).astype(x.dtype))
-        h, kept = self.inner(x.ravel()), []
+        angles = 100.0 * t * jnp.asarray(128.0 ** (-np.arange(half) / half), x.dtype)
+        time = jnp.concatenate([jnp.sin(angles), jnp.cos(angles)]).astype(x.dtype)
+        h, kept = jax.nn.silu(self.inner(x.ravel())), []
         for level in self.down:
             h, state = level(h, time, state)
             kept.append(h)
+        h = h + jax.nn.silu(self.middle(h))
         for level in self.up:
             h, state = level(jnp.concatenate([h, kept.pop()]), time, state)
         return self.outer(h).reshape(x.shape), state
 
 
 class _Level(eqx.Module):
-    """Two dense layers, the time embedding between them, batch normalisation."""
+    """Two dense layers and batch normalisation; the first is residual, scaled and shifted by the time embedding."""
 
     first: eqx.nn.Linear
     time: eqx.nn.Linear
@@ -146,15 +175,15 @@ class _Level(eqx.Module):
 
     def __init__(self, size_in: int, size: int, embedding: int, *, key: PRNGKeyArray):
         keys = jr.split(key, 3)
-        self.first = eqx.nn.Linear(size_in, size, key=keys[0])
-        self.time = eqx.nn.Linear(embedding, size, key=keys[1])
-        self.second = eqx.nn.Linear(size, size, key=keys[2])
+        self.first = _xavier(size_in, size_in, keys[0])
+        self.time = _xavier(embedding, 2 * size_in, keys[1])
+        self.second = _xavier(size_in, size, keys[2])
         self.norm = eqx.nn.BatchNorm(size, axis_name="batch", mode="batch")
 
     def __call__(self, x, time, state):
-        h = jax.nn.silu(self.first(x)) + self.time(time)
-        h, state = self.norm(jax.nn.silu(self.second(h)), state)
-        return h, state
+        scale, shift = jnp.split(self.time(time), 2)
+        h = x + jax.nn.silu(self.first(x) * (1 + scale) + shift)
+        return self.norm(jax.nn.silu(self.second(h)), state)
 
 
 class WithState(eqx.Module):
@@ -170,13 +199,24 @@ class WithState(eqx.Module):
         return eqx.nn.inference_mode(self.network)(t, x, v, theta, self.state)[0]
 
 
-def over_batch(network, inputs):
-    """Outputs of rows of inputs, and the network with its state renewed."""
+ROWWISE = (0, 0, None, None)
+"""Axes of (t, x, v, theta): the rows of a batch share their target and context."""
+
+
+def over_batch(network, t, x, v, theta):
+    """Outputs of rows of (t, x), and the network with its state renewed."""
     if isinstance(network, WithState):
-        mapped = jax.vmap(network.network, (0, 0, 0, 0, None), (0, None), axis_name="batch")
-        outputs, state = mapped(*inputs, network.state)
+        mapped = jax.vmap(network.network, (*ROWWISE, None), (0, None), axis_name="batch")
+        outputs, state = mapped(t, x, v, theta, network.state)
         return outputs, WithState(network.network, state)
-    return jax.vmap(network)(*inputs), network
+    return jax.vmap(network, ROWWISE)(t, x, v, theta), network
+
+
+def _xavier(size_in: int, size: int, key: PRNGKeyArray) -> eqx.nn.Linear:
+    """Glorot and Bengio's normal initialisation, biases 0."""
+    linear = _zero(eqx.nn.Linear(size_in, size, key=key))
+    weight = jnp.sqrt(2.0 / (size_in + size)) * jr.normal(key, linear.weight.shape, linear.weight.dtype)
+    return eqx.tree_at(lambda m: m.weight, linear, weight.astype(linear.weight.dtype))
 
 
 def _zero(linear: eqx.nn.Linear) -> eqx.nn.Linear:

@@ -111,13 +111,15 @@ def train(
     file: Path | None = None,
     problem: Any = None,
     progress: bool = True,
+    watch: Callable[[Any, dict[str, Array]], None] | None = None,
 ) -> tuple[Any, dict[str, Array]]:
     """The best network, and the history.
 
     `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)` a value
     to be maximised, the bound and the ESS fraction on held-out paths. Update i uses `fold_in(key, i)`: the same key
     gives the same network, however often training is resumed from `file`, which is refused where it was written for
-    another `problem` (a pytree of arrays), another key or other settings.
+    another `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is called at each
+    look with the network that was looked at. Seconds are of the updates, compilation apart.
     """
     optimizer, decay = training.optimizer, training.average
     judge = eqx.filter_jit(judge)
@@ -173,16 +175,26 @@ def train(
             ),
         )
 
+    def rows(state: _State) -> dict[str, Array]:
+        kept = np.isfinite(np.asarray(state.history["update"]))
+        return {k: v[kept] for k, v in state.history.items()}
+
+    def show(state: _State) -> None:
+        if watch is not None:
+            watch(eqx.combine(state.average, static), rows(state))
+
     label = _label(name, problem, arrays, key, training)
     if file is not None and file.exists():
         state = _load(file, state, label)
     else:
         state = look(state, jnp.nan, 0.0)
+    compiled = advance.lower(state).compile()
+    show(state)
     spent = float(np.nanmax(np.asarray(state.history["seconds"])))
     with tqdm(total=training.num_updates, initial=int(state.update), desc=name, disable=not progress) as bar:
         while int(state.update) < training.num_updates and not _stopped(state, training):
             begin = time.perf_counter()
-            new, losses = jax.block_until_ready(advance(state))
+            new, losses = jax.block_until_ready(compiled(state))
             if not bool(jnp.all(jnp.isfinite(losses))):
                 first = int(state.update) + int(jnp.argmax(~jnp.isfinite(losses)))
                 warnings.warn(
@@ -198,8 +210,8 @@ def train(
             row = {k: float(v[int(state.update) // training.interval]) for k, v in state.history.items()}
             bar.set_postfix_str(f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %")
             bar.update(training.interval)
-    rows = np.isfinite(np.asarray(state.history["update"]))
-    return eqx.combine(state.best, static), {k: v[rows] for k, v in state.history.items()}
+            show(state)
+    return eqx.combine(state.best, static), rows(state)
 
 
 def _stopped(state: _State, training: Training) -> bool:
