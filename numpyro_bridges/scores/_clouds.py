@@ -146,7 +146,8 @@ def _cloud(bridge, key, y, advance, log_pair, log_weight, rho, given=None) -> Cl
         logits = logits + jax.vmap(log_weight, (None, 0))(times, y)
         weights, past = jax.nn.softmax(logits), g + pull
         if rho is None:
-            rho = moves * _coefficient(jax.vmap(lambda x, s: whiten(bridge, t0, x, s)), weights, new, push, past)
+            rho = _coefficient(jax.vmap(lambda x, s: whiten(bridge, t0, x, s)), weights, new, push, past)
+        rho = moves * rho
         g = push + rho * past
         poor = 1 / jnp.sum(weights**2) < size / 2
         chosen = jnp.where(poor, _systematic(key_resample, weights), jnp.arange(size))
