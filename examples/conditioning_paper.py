@@ -192,7 +192,7 @@ def panels(num_rows, num_columns, size=2.3, shape=None):
 
 def magnifier(start, ends):
     """What makes small deviations from the start visible, and a word on it."""
-    times = max(1, round(0.08 / rms(ends - start)))
+    times = max(1, int(0.08 / rms(ends - start)))
     words = f"deviations from the start × {times}" if times > 1 else ""
     return lambda shapes: np.asarray(start + times * (np.asarray(shapes) - start)), words
 
