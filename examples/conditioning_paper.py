@@ -181,7 +181,7 @@ def save(name):
 
 def panels(num_rows, num_columns, size=2.3, shape=None):
     """Axes without frames, `size` inches wide, in the proportions of a shape."""
-    aspect = 0.85 if shape is None else np.ptp(shape[:, 1]) / np.ptp(shape[:, 0])
+    aspect = 0.65 if shape is None else np.ptp(shape[:, 1]) / np.ptp(shape[:, 0])
     inches = (size * num_columns, (1.2 * size * aspect + 0.35) * num_rows)
     figure, axes = plt.subplots(num_rows, num_columns, figsize=inches, squeeze=False, layout="constrained")
     for ax in axes.flat:
@@ -192,7 +192,7 @@ def panels(num_rows, num_columns, size=2.3, shape=None):
 
 def magnifier(start, ends):
     """What makes small deviations from the start visible, and a word on it."""
-    times = max(1, round(0.08 / rms(ends - start)))
+    times = max(1, int(0.08 / rms(ends - start)))
     words = f"deviations from the start × {times}" if times > 1 else ""
     return lambda shapes: np.asarray(start + times * (np.asarray(shapes) - start)), words
 
@@ -422,8 +422,8 @@ def species():
         nb.plot.outlines(x0, below, color="#003f5c", linewidth=1.4)
         nb.plot.outlines(magnified(v), below, color="#d55e00", linewidth=1.4)
     figure.colorbar(lines, ax=axes[0], label="time")
-    title = "above: mean of 20 paths; below: start (dark), end (orange) and the paths at time 1/2"
-    figure.suptitle(title + (f"; {words}" if words else ""), fontsize=9)
+    title = "above: mean of 20 paths; below: start (dark), end (orange), paths at time 1/2"
+    figure.suptitle(title + (f"\n{words}" if words else ""), fontsize=9)
     save("species.png")
 
 
