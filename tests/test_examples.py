@@ -22,7 +22,7 @@ ENVIRONMENT = os.environ | {
 
 def run(*command, cwd):
     done = subprocess.run(
-        [sys.executable, *command], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300
+        [sys.executable, *command], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -71,6 +71,7 @@ def test_learned_vs_guided(tmp_path):
         assert (tmp_path / "output" / name).stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_conditioning_paper(tmp_path):
     pytest.importorskip("ktch")
     pytest.importorskip("matplotlib")
