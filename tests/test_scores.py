@@ -231,6 +231,12 @@ def test_divergence_of_a_kunita_flow(key):
     found = flow.covariance_divergence(0.0, jnp.asarray(x))
     np.testing.assert_allclose(found, np.sum(K[..., None] * d, 1) / (2 * ell**2), rtol=1e-10)
     np.testing.assert_allclose(found, AbstractSDE.covariance_divergence(flow, 0.0, jnp.asarray(x)), rtol=1e-10)
+    again = flow.covariance_double_divergence(0.0, jnp.asarray(x))
+    square = np.sum(d**2, -1)
+    np.testing.assert_allclose(
+        again, np.sum(K * (1 - np.eye(4)) * (2 - square / (2 * ell**2))) / (2 * ell**2), rtol=1e-10
+    )
+    np.testing.assert_allclose(again, AbstractSDE.covariance_double_divergence(flow, 0.0, jnp.asarray(x)), rtol=1e-10)
 
 
 # The gradient of the evidence bound.

@@ -10,12 +10,10 @@ so that h(t, ·) is the law of a weighted cloud that starts at what is observed 
 (Haussmann and Pardoux 1986).
 """
 
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._types import RealScalar, State
-from ..sdes import AbstractSDE
+from ..sdes import AbstractSDE, divergence
 from ..spaces import AbstractSpace
 
 
@@ -45,8 +43,4 @@ class ReversedSDE(AbstractSDE):
     def rate(self, t: RealScalar, x: State) -> Float[Array, ""]:
         """c."""
         t = self.clock - t
-
-        def field(y):
-            return 0.5 * self.sde.covariance_divergence(t, y) - self.sde.drift(t, y)
-
-        return jnp.trace(jax.jacfwd(field)(x).reshape(x.size, x.size))
+        return 0.5 * self.sde.covariance_double_divergence(t, x) - divergence(lambda y: self.sde.drift(t, y), x)

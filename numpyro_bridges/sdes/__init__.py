@@ -1,4 +1,10 @@
-from ._base import AbstractSDE as AbstractSDE, AffineStep as AffineStep, Transition as Transition, simulate as simulate
+from ._base import (
+    AbstractSDE as AbstractSDE,
+    AffineStep as AffineStep,
+    Transition as Transition,
+    divergence as divergence,
+    simulate as simulate,
+)
 from ._kunita import KunitaFlow as KunitaFlow
 from ._linear import BrownianMotion as BrownianMotion, LinearSDE as LinearSDE
 from ._noise import (

@@ -10,6 +10,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from .._checks import floating, require
 from .._linalg import add, apply, columns, full_precision, promote
@@ -84,6 +85,12 @@ class AbstractSDE(eqx.Module):
             return jnp.zeros_like(x)
         jacobian = jax.jacfwd(lambda y: promote(self.covariance(t, y), 2, x.shape[0]))(x)
         return jnp.einsum("ijj...->i...", jacobian)
+
+    def covariance_double_divergence(self, t: RealScalar, x: State) -> Float[Array, ""]:
+        """∇·div a = Σ_ij ∂²a_ij/∂x_i∂x_j."""
+        if self.has_constant_covariance(x):
+            return jnp.zeros((), x.dtype)
+        return divergence(lambda y: self.covariance_divergence(t, y), x)
 
     def noise_size(self, x: State) -> int:
         """Number k of driving noises per column."""
@@ -175,6 +182,11 @@ def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
 
     _, path = jax.lax.scan(step, x0, (ts[:-1], ts[1:], noise))
     return jnp.concatenate([x0[None], path])
+
+
+def divergence(field: Callable, x: State) -> Float[Array, ""]:
+    """∇·field at x, for a field shaped like x."""
+    return jnp.trace(jax.jacfwd(field)(x).reshape(x.size, x.size))
 
 
 def as_state_shift(shift, x: State) -> State:

@@ -8,6 +8,7 @@ Sommer, Schauer, van der Meulen (2021), and Baker et al. (2024), section 2.
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._checks import concrete, require, require_instance
 from .._types import RealScalar, State, Structured
@@ -86,6 +87,17 @@ class KunitaFlow(AbstractSDE):
             return super().covariance_divergence(t, x)
         slope = jax.grad(self.covariance_kernel, argnums=1)
         return jnp.sum(jax.vmap(lambda p: jax.vmap(lambda q: slope(p, q))(x))(x), axis=1)
+
+    def covariance_double_divergence(self, t: RealScalar, x: State) -> Float[Array, ""]:
+        if not isinstance(self.space, Landmarks):
+            return super().covariance_double_divergence(t, x)
+
+        def mixed(p, q):
+            """tr ∂²k/∂p∂q."""
+            return jnp.trace(jax.jacfwd(jax.grad(self.covariance_kernel, argnums=1))(p, q))
+
+        pairs = jax.vmap(lambda p: jax.vmap(lambda q: mixed(p, q))(x))(x)
+        return jnp.sum(pairs) - jnp.trace(pairs)  # a(x, x) is constant
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         return jnp.zeros((), x.dtype), jnp.zeros_like(x)
