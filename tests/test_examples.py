@@ -111,3 +111,13 @@ def test_mcmc_benchmark(tmp_path):
 def test_guided_weight_benchmark(tmp_path):
     out = run(str(ROOT / "benchmarks/guided_weight.py"), "--quick", cwd=tmp_path)
     assert float(re.search(r'"value_difference": ([^,]*)', out).group(1)) < 1e-4
+
+
+@pytest.mark.slow
+def test_score_table_benchmark(tmp_path):
+    """A small version: two landmarks, 20 updates of ours, from nothing."""
+    pytest.importorskip("matplotlib")
+    out = run(str(ROOT / "benchmarks/score_table.py"), "--quick", "--output", "output", cwd=tmp_path)
+    (row,) = [json.loads(line) for line in out.splitlines()]
+    assert row["error"] < 1 and row["reference"]["steps_per_second"] > 0, row
+    assert (tmp_path / "output" / "score_table.png").stat().st_size > 5000

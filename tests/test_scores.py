@@ -418,6 +418,17 @@ def test_the_best_network_is_kept():
     assert np.all(last != 0) and history["update"][-1] == 30
 
 
+def test_training_is_watched():
+    """At each look, with the network as it is and the history so far, the start included."""
+    seen = []
+    network, _ = trained(
+        nb.scores.Training(10, interval=5, patience=None),
+        watch=lambda network, history: seen.append((network, history)),
+    )
+    assert [list(history["update"]) for _, history in seen] == [[0], [0, 5], [0, 5, 10]]
+    np.testing.assert_array_equal(seen[-1][0], network)
+
+
 # Networks.
 
 
@@ -439,6 +450,23 @@ def test_networks_start_at_zero(key):
     v, x = curve(5)
     for make in (lambda: nb.scores.MLP((5, 2), 1, key=key), lambda: nb.scores.PointNetwork(2, 1, key=key)):
         assert not np.any(make()(jnp.array(0.3), x, v, jnp.ones(1)))
+
+
+def test_the_singular_part_of_a_network(key):
+    """(network(t, x/l, v, θ) + g(t) x/l)/l with l = √(1 − t + softness); 0 as long as its parts are."""
+    v, x = (jnp.asarray(a) for a in curve(5))
+    network = nb.scores.Singular(nb.scores.MLP((5, 2), 1, key=key), key=key, softness=0.01)
+    t, theta = jnp.array(0.9), jnp.ones(1)
+    assert not np.any(network(t, x, v, theta))
+    network = randomised(network, key)
+    length = np.sqrt(0.11)
+    here, doubled = (
+        network(t, c * x, v, theta) - network.network(t, c * x / length, v, theta) / length for c in (1, 2)
+    )
+    gain = np.asarray(here)[0, 0] * 0.11 / np.asarray(x)[0, 0]
+    assert abs(gain) > 1e-3
+    np.testing.assert_allclose(here, gain * x / 0.11, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(doubled, 2 * here, rtol=1e-6, atol=1e-9)
 
 
 def test_a_point_network_sees_a_set_of_points(key):

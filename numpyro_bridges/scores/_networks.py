@@ -143,7 +143,12 @@ class UNet(eqx.Module):
     @classmethod
     def build(cls, shape, widths, embedding, *, key: PRNGKeyArray) -> "WithState":
         """The network with its running means."""
-        return WithState(*eqx.nn.make_with_state(cls)(shape, widths, embedding, key=key))
+
+        @eqx.filter_jit  # one program, in place of a small one for each array
+        def made(key):
+            return WithState(*eqx.nn.make_with_state(cls)(shape, widths, embedding, key=key))
+
+        return made(key)
 
     @classmethod
     def published(cls, shape, num_bases: int, *, key: PRNGKeyArray) -> "WithState":
