@@ -9,7 +9,7 @@ dX = 0.1 dW in every coordinate, 100 steps of one length. N landmarks, or the 2N
 `FourierBasis(N, 2)` (published: N complex numbers a coordinate). The inexact condition has a point SD of 0.05: its
 variance is 0.0025 for each coordinate of a landmark, or each coefficient.
 
-One JSON line per cell, condition, method and setting:
+One JSON line per cell, condition, method and setting (rows that DIR already has of others are kept):
 
 - `published_rmse`: root mean square of trained minus true score at x = x0 = target, over times, points and coordinates.
   The true score is 0 there, so a network that says 0 has none.
@@ -33,6 +33,7 @@ nothing; `nothing` learns all of the score with `Unguided()` and a network whose
 
 import argparse
 import json
+import operator
 import os
 import time
 from pathlib import Path
@@ -285,13 +286,13 @@ def plot(rows, references, path):
     lines = -(-len(references) // columns)
     figure, axes = plt.subplots(lines, columns, figsize=(3.6 * columns, 2.6 * lines), sharey=True, squeeze=False)
     for axis, (name, curve) in zip(axes.flat, references.items(), strict=False):
-        axis.plot([r["cpu_seconds"] for r in curve], [r["error"] for r in curve], "k", label="published recipe")
+        axis.plot([r["cpu_seconds"] for r in curve], [r["error"] for r in curve], "k.-", label="published recipe")
         for row in rows:
-            if (row["cell"], row["condition"]) == name and row["setting"] == "nothing":
+            if f"{row['cell']} {row['condition']}" == name and row["setting"] == "nothing":
                 spent = [r["cpu_seconds"] for r in row["curve"]]
                 axis.plot(spent, [r["error"] for r in row["curve"]], ".-", label=f"{row['method']}, from nothing")
         axis.axhline(0.01, color="0.7", lw=0.8)
-        axis.set(yscale="log", title=" ".join(name))
+        axis.set(xscale="log", yscale="log", title=name)
         axis.title.set_fontsize(8)
         axis.tick_params(labelsize=7)
     axes.flat[0].legend(fontsize=6)
@@ -304,8 +305,10 @@ def plot(rows, references, path):
 
 
 def main(arguments):
-    rows, references = [], {}
     arguments.output.mkdir(parents=True, exist_ok=True)
+    file = arguments.output / "score_table.json"
+    record = json.loads(file.read_text()) if file.exists() else {"rows": [], "references": {}}
+    key = operator.itemgetter("cell", "condition", "method", "setting")
     for condition in arguments.conditions:
         for name in arguments.cells:
             cell, epochs = Cell(name, condition), arguments.epochs or EPOCHS[name]
@@ -316,14 +319,13 @@ def main(arguments):
                 if (method, setting) != ("residual", "nothing")
             ]
             watch = reference(cell, epochs, max(row["cpu_seconds"] for row in found), every=arguments.every)
-            references[name, condition] = watch.curve
+            record["references"][f"{name} {condition}"] = watch.curve
             for row in found:
                 row = beside(row, watch, epochs)
-                rows.append(row)
+                record["rows"] = [r for r in record["rows"] if key(r) != key(row)] + [row]
                 print(json.dumps(rounded({k: v for k, v in row.items() if k != "curve"})), flush=True)
-            record = {"rows": rows, "references": {" ".join(k): v for k, v in references.items()}}
-            (arguments.output / "score_table.json").write_text(json.dumps(record))
-            plot(rows, references, arguments.output / "score_table.png")
+            file.write_text(json.dumps(record))
+            plot(**record, path=arguments.output / "score_table.png")
 
 
 if __name__ == "__main__":
@@ -333,7 +335,7 @@ if __name__ == "__main__":
     parser.add_argument("--conditions", nargs="+", choices=("exact", "inexact"), default=["exact", "inexact"])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--settings", nargs="+", choices=("guide", "nothing"), default=["nothing", "guide"])
-    parser.add_argument("--updates", type=int, default=500, help="of ours, at most")
+    parser.add_argument("--updates", type=int, default=400, help="of ours, at most")
     parser.add_argument("--epochs", type=int, help="of the reference's schedule; as published by default")
     parser.add_argument("--freeze", type=Path, help="write the reference's curves here, and nothing else")
     parser.add_argument("--budget", type=float, default=np.inf, help="seconds of the reference's training in a cell")
