@@ -293,6 +293,18 @@ def test_noise_with_another_use_has_its_posterior():
     assert np.var(noise) == pytest.approx(1 / 3, rel=0.03)
 
 
+def test_small_turns_are_accepted():
+    """The energy error of `PCNL` is of third order in its angle: a kick whose work is left out would be of first."""
+    state = (kernel := PCNL(NOISE_ONLY, angle=0.1, adapt_angle=False)).init(jr.key(0), 0, None, (DATA,), {})
+
+    def one(state, _):
+        state = kernel.sample(state, (DATA,), {})
+        return state, state.accept_prob
+
+    _, rates = jax.jit(lambda state: jax.lax.scan(one, state, length=200))(state)
+    assert 1 - np.mean(rates) < 2e-4
+
+
 def test_chain_methods_and_pickling():
     """One chain of `vectorized` is the chain of `sequential`; a pickled kernel runs the same chain."""
     kernel = FunctionSpaceHMC(conjugate)
