@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import numpyro_bridges as nb
+from numpyro_bridges.guiding._score import Standard
 
 pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
 
@@ -461,7 +462,49 @@ LAWS = [
     ),
 ]
 
-CASES = SDES + CONDITIONS + BRIDGES + LAWS
+
+def fitted(sde=OU, condition=None, x0=X, **kwargs):
+    condition = NEAR.at(X) if condition is None else condition
+    options = {"t1": 1.0, "num_steps": 3, "key": jr.key(0), "progress": False} | kwargs
+    return nb.scores.fit(sde, condition, x0=x0, **options)
+
+
+def set_of(x):
+    return nb.CylinderSet(x, x + 1)
+
+
+def trained_for(shape):
+    standard = Standard(*(jnp.ones(s) for s in ((), shape, shape, shape, 0, 0)))
+    return nb.scores.ScoreGuide(nb.FrozenGuide(), lambda t, x, v, theta: 0 * x, standard)
+
+
+HYPO = nb.LinearSDE(np.eye(3, k=1), np.array([[0.0], [0.0], [1.0]]))
+PART, SET = nb.InexactMatch(0.1, np.array([[1.0, 0.0, 0.0]])).at([0.3]), set_of(X)
+SCORES = [
+    ("method", lambda: fitted(method="magic"), "`method` must be one of .*'adjoint', 'residual', 'reversal'.*'magic'"),
+    ("adjoint-of-a-part", lambda: fitted(condition=PART, method="adjoint"), "'adjoint'.*whole state.*'residual'"),
+    ("adjoint-of-a-set", lambda: fitted(condition=SET, method="adjoint"), "'adjoint'.*whole state.*'residual'"),
+    ("reversal-of-a-set", lambda: fitted(condition=SET, method="reversal"), "'reversal'.*observed value.*'residual'"),
+    ("adjoint-hypoelliptic", lambda: fitted(HYPO, method="adjoint"), "'adjoint'.*every direction.*'residual'"),
+    ("reversal-hypoelliptic", lambda: fitted(HYPO, method="reversal"), "'reversal'.*every direction.*'residual'"),
+    (
+        "guide-of-another-size",
+        lambda: bridge(guide=trained_for((2, 1))),
+        r"`guide` was trained for states \(2, 1\); .*3",
+    ),
+    ("guide-of-no-guide", lambda: nb.scores.ScoreGuide(3, abs, None), r"`guide` must be a guide.*got 3"),
+    ("network-of-no-function", lambda: nb.scores.ScoreGuide(nb.FrozenGuide(), 3, None), "`network` must be a func.*3"),
+    ("context-of-no-function", lambda: fitted(context=3), "`context` must be a function of the SDE; got 3"),
+    ("training-of-a-number", lambda: fitted(training=3), r"`training` must be a `Training\(...\)`; got 3"),
+    ("no-updates", lambda: nb.scores.Training(0), "`num_updates` must be a positive integer; got 0"),
+    ("half-a-batch", lambda: nb.scores.Training(9, 0.5), "`batch_size` must be a positive integer; got 0.5"),
+    ("interval", lambda: nb.scores.Training(9, interval=0), "`interval` must be a positive integer; got 0"),
+    ("held-out", lambda: nb.scores.Training(9, held_out=-1), "`held_out` must be a positive integer; got -1"),
+    ("average", lambda: nb.scores.Training(9, average=1.0), r"`average` must be in \[0, 1\); got 1.0"),
+    ("learning-rate", lambda: nb.scores.Training(9, learning_rate=0.0), "`learning_rate` must be positive; got 0.0"),
+]
+
+CASES = SDES + CONDITIONS + BRIDGES + LAWS + SCORES
 
 
 @pytest.mark.parametrize("make, message", [pytest.param(*case, id=name) for name, *case in CASES])

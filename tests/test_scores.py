@@ -115,7 +115,7 @@ def test_targets_are_scores_on_average(model, method):
     truth = score_forward if method == "forward" else score
     draw = jax.jit(lambda keys, rho: jax.lax.map(lambda key: make(key, 500, rho), keys))
     fitted = jax.jit(lambda key: make(key, 500).rho)(jr.key(2))
-    half = 0.5 * (fitted > 0)  # an end that is fixed does not move
+    half = jnp.where(fitted > 0, 0.5, 0.0)  # an end that is fixed does not move
 
     for rho in (fitted, 0 * half, half):
         cloud = draw(jr.split(jr.key(1), 20), rho)
@@ -192,7 +192,7 @@ def test_the_weighted_adjoint_process_is_h(name):
             print(name, k, found - truth / sd, error)
             assert error < 0.02 and abs(found - truth / sd) < 3 * error + 0.01
             size = np.sqrt(np.sum(h * slope(grid) ** 2) / np.sum(h))
-            found, error = mean_and_error(np.sum(w[:, k] * (g[:, k] * f(x[:, k]) + slope(x[:, k])), 1) / size)
+            found, error = mean_and_error(np.sum(w[:, k] * (g[:, k] * (f(x[:, k]) - truth) + slope(x[:, k])), 1) / size)
             print(name, k, "score", found, error)
             assert error < 0.08 and abs(found) < 3 * error
 
@@ -294,30 +294,32 @@ def test_the_gradient_of_the_bound_is_unbiased():
     assert np.all(np.abs(gap) < 3 * error)
 
 
-OPTIMA = {"drift": (nb.LinearSDE(0.0, 1.0, 1.0), 0.5), "ou-1": (nb.LinearSDE(-1.0, 1.0), -0.41928),
-          "ou-5": (nb.LinearSDE(-5.0, 1.0), -1.15132)}  # fmt: skip
+OPTIMA = {"drift": (nb.LinearSDE(0.0, 1.0, 1.0), 0.5, 50), "ou-1": (nb.LinearSDE(-1.0, 1.0), -0.41928, 200),
+          "ou-5": (nb.LinearSDE(-5.0, 1.0), -1.15132, 400)}  # fmt: skip
 
 
-@pytest.mark.parametrize("case", list(OPTIMA))
+@pytest.mark.parametrize("case", ["drift", *(pytest.param(c, marks=pytest.mark.slow) for c in ("ou-1", "ou-5"))])
 def test_the_bound_reaches_its_optimum(case):
     """−E log(w/h̃(0, x0)) within 1 % of log(h̃/h)(0, x0): a Brownian motion guides what it is not."""
-    sde, optimum = OPTIMA[case]
+    sde, optimum, num_steps = OPTIMA[case]
+    guide, match = nb.FrozenGuide(nb.BrownianMotion(1.0)), nb.ExactMatch().at([0.0])
     score = nb.scores.fit(
         sde,
-        nb.ExactMatch().at([0.0]),
+        match,
         x0=[0.0],
         t1=1.0,
-        num_steps=50,
-        guide=nb.FrozenGuide(nb.BrownianMotion(1.0)),
+        num_steps=num_steps,
+        guide=guide,
         network=nb.scores.MLP((1, 1), key=jr.key(1), width=16, depth=2),
         training=nb.scores.Training(400, 32, learning_rate=1e-2, interval=200),
         key=jr.key(0),
         progress=False,
     )
-    found = -(np.max(score.history["bound"]) - scipy.stats.norm.logpdf(0.0))
-    print(case, found, score.history)
+    bridge = nb.GuidedBridge(sde, match, x0=[0.0], t1=1.0, num_steps=num_steps, guide=score)
+    log_weight = np.asarray(jax.jit(jax.vmap(bridge.log_weight))(jr.normal(jr.key(2), (4000, num_steps, 1, 1))))
+    found, error = mean_and_error(scipy.stats.norm.logpdf(0.0) - log_weight)
+    assert error < 0.004 * abs(optimum)
     assert abs(found - optimum) < 0.01 * abs(optimum)
-    assert score.history["ess"][-1] > 0.95
 
 
 # Training.
@@ -495,8 +497,8 @@ def test_a_guide_of_landmarks_does_not_see_translations(key):
 
 
 def test_a_network_with_running_means():
-    """The published U-net trains from nothing, and its batch normalisation keeps means."""
-    network = nb.scores.UNet.published((1, 2), 2, key=jr.key(1))
+    """A U-net like the published one trains from nothing, and its batch normalisation keeps means."""
+    network = nb.scores.UNet.build((1, 2), (4, 2), 4, key=jr.key(1))
     score = nb.scores.fit(
         nb.BrownianMotion(0.5),
         nb.InexactMatch(0.1).at([[0.3, 0.1]]),
@@ -507,7 +509,7 @@ def test_a_network_with_running_means():
         method="adjoint",
         guide=nb.scores.Unguided(),
         network=network,
-        training=nb.scores.Training.published(1),
+        training=nb.scores.Training(4, 8, interval=2, held_out=8, patience=None, one_step=True),
         progress=False,
     )
     assert isinstance(score.network, nb.scores.WithState)
@@ -522,7 +524,7 @@ def test_a_network_with_running_means():
 QUICK = nb.scores.Training(10, 8, interval=5, held_out=8)
 
 
-@pytest.mark.parametrize("method", ["residual", "adjoint", "reversal"])
+@pytest.mark.parametrize("method", ["residual", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)])
 def test_an_exact_guide_is_not_spoilt(method):
     """Weights stay constant: Brownian motion and its own guide."""
     sde, match = nb.LinearSDE(-0.5, 0.4, 0.3), nb.InexactMatch(0.1).at([0.3])
@@ -606,9 +608,9 @@ def sine_evidence(ts, v=np.pi / 2):
     return np.log(np.sum(step(0.0, grid, dts[0]) * h) * (grid[1] - grid[0]))
 
 
-@pytest.mark.parametrize("method", ["residual", "adjoint", "reversal"])
+@pytest.mark.parametrize("method", ["residual", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)])
 def test_the_sine_bridge(method):
-    """A multimodal bridge, where a Brownian guide has an ESS of 0.6 %: twenty times that, and the evidence within 3 SE."""
+    """A multimodal bridge, where a Brownian guide has an ESS of 0.3 %: twenty times that; the evidence within 3 SE."""
     match = nb.ExactMatch().at([np.pi / 2])
     guide = nb.FrozenGuide(nb.BrownianMotion(0.25))
     score = nb.scores.fit(

@@ -305,7 +305,7 @@ def _regression(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray)
 
 
 def _judge(problem: Problem, key: PRNGKeyArray):
-    """E log w, and the ESS fraction, on held-out paths."""
+    """E log w, and the ESS fraction, on held-out paths. Weights that do not vary are a perfect guide's: value ∞."""
     draws = 16 if problem.amortised else 1
     size = -(-problem.training.held_out // draws)
 
@@ -315,10 +315,14 @@ def _judge(problem: Problem, key: PRNGKeyArray):
             bridge = problem.draw(key_draw).with_guide(_with_network(problem.guide, network))
             noise = jr.normal(key_noise, (size, *bridge.noise_shape), bridge.x0.dtype)
             log_weights = jax.vmap(bridge.log_weight)(noise)
-            return jnp.mean(log_weights), weights.effective_sample_size(log_weights) / size
+            ess = weights.effective_sample_size(log_weights) / size
+            return jnp.mean(log_weights), ess, jnp.std(log_weights)
 
-        bound, ess = jax.tree.map(jnp.mean, jax.vmap(one)(jr.split(key, draws)))
+        bounds, ess, spread = jax.vmap(one)(jr.split(key, draws))
+        bound, ess = jnp.mean(bounds), jnp.mean(ess)
         value = jnp.where(jnp.isfinite(bound), bound, -jnp.inf)
+        perfect = (size > 1) & jnp.all(spread < jnp.sqrt(jnp.finfo(spread.dtype).eps))
+        value = jnp.where(perfect, jnp.inf, value)
         return value, bound, ess
 
     return judge

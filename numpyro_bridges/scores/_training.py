@@ -161,7 +161,7 @@ def train(
 
     def look(state: _State, loss_value, seconds) -> _State:
         value, bound, ess = judge(eqx.combine(state.average, static))
-        better = bool(value > state.best_value) or (training.patience is None and bool(jnp.isfinite(value)))
+        better = bool(value > state.best_value) or (training.patience is None and bool(value > -jnp.inf))
         i = int(state.update) // training.interval
         row = {"update": float(state.update), "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
         return eqx.tree_at(
