@@ -135,10 +135,10 @@ class Enough(Exception):
 class Watch:
     """Errors against training time, the time of the errors' evaluation apart; stops at a number of seconds."""
 
-    def __init__(self, cell: Cell, name: str, most: float = np.inf, every: int = 1):
-        self.cell, self.name, self.most, self.every = cell, name, most, every
+    def __init__(self, cell: Cell, name: str, most: float = np.inf):
+        self.cell, self.name, self.most = cell, name, most
         self.curve: list[dict] = []
-        self.spent, self.looks, self.updates = np.zeros(2), 0, 0
+        self.spent, self.updates = np.zeros(2), 0
         self.stamp = np.zeros(2)
 
     def __call__(self, name, guide):
@@ -147,16 +147,15 @@ class Watch:
         if update > 0:
             self.spent = self.spent + now - self.stamp
             self.updates += update - int(guide.history["update"][-2])
-        if name == self.name and self.looks % self.every == 0:
+        if name == self.name:
             row = {"updates": self.updates, "seconds": float(self.spent[0]), "cpu_seconds": float(self.spent[1])}
             self.curve.append(row | self.cell.errors(guide))
-        self.looks += 1
         if self.spent[1] > self.most:
             raise Enough
         self.stamp = np.array([time.perf_counter(), time.process_time()])
 
 
-def reference(cell: Cell, epochs: int, budget: float, every: int = 1) -> Watch:
+def reference(cell: Cell, epochs: int, budget: float) -> Watch:
     """The published recipe, for at most `budget` seconds of the processor."""
     network = nb.scores.UNet.published(cell.target.shape, cell.num_bases, key=jr.key(0))
     recipe = nb.scores.Training.published(epochs)
@@ -170,7 +169,7 @@ def reference(cell: Cell, epochs: int, budget: float, every: int = 1) -> Watch:
         patience=recipe.patience,
         one_step=recipe.one_step,
     )
-    watch = Watch(cell, "adjoint", budget, every)
+    watch = Watch(cell, "adjoint", budget)
     try:
         nb.scores.fit(
             **cell.problem,
@@ -239,6 +238,8 @@ def train(cell: Cell, method: str, setting: str, num_updates: int) -> dict:
         "seconds": seconds,
         "cpu_seconds": cpu,
         "with_compilation": total,
+        "jax": jax.__version__,
+        "device": jax.devices()[0].device_kind,
         "steps_per_second": watch.updates * training.batch_size * NUM_STEPS / cpu,
         "curve": [*watch.curve, {**watch.curve[-1], **found}],
     }
@@ -265,8 +266,6 @@ def beside(row: dict, watch: Watch, epochs: int) -> dict:
         "cpu_seconds_over_reference": row["cpu_seconds"] / whole["cpu_seconds"],
         "seconds_over_reference": row["seconds"] / whole["seconds"],
         "throughput_over_reference": row["steps_per_second"] / speed,
-        "jax": jax.__version__,
-        "device": jax.devices()[0].device_kind,
     }
 
 
@@ -318,14 +317,16 @@ def main(arguments):
                 for method in arguments.methods
                 if (method, setting) != ("residual", "nothing")
             ]
-            watch = reference(cell, epochs, max(row["cpu_seconds"] for row in found), every=arguments.every)
-            record["references"][f"{name} {condition}"] = watch.curve
+            if not arguments.without_reference:
+                watch = reference(cell, epochs, max(row["cpu_seconds"] for row in found))
+                record["references"][f"{name} {condition}"] = watch.curve
+                found = [beside(row, watch, epochs) for row in found]
             for row in found:
-                row = beside(row, watch, epochs)
                 record["rows"] = [r for r in record["rows"] if key(r) != key(row)] + [row]
                 print(json.dumps(rounded({k: v for k, v in row.items() if k != "curve"})), flush=True)
             file.write_text(json.dumps(record))
-            plot(**record, path=arguments.output / "score_table.png")
+            if record["references"]:
+                plot(**record, path=arguments.output / "score_table.png")
 
 
 if __name__ == "__main__":
@@ -337,11 +338,11 @@ if __name__ == "__main__":
     parser.add_argument("--settings", nargs="+", choices=("guide", "nothing"), default=["nothing", "guide"])
     parser.add_argument("--updates", type=int, default=400, help="of ours, at most")
     parser.add_argument("--epochs", type=int, help="of the reference's schedule; as published by default")
+    parser.add_argument("--without-reference", action="store_true", help="ours alone")
     parser.add_argument("--freeze", type=Path, help="write the reference's curves here, and nothing else")
     parser.add_argument("--budget", type=float, default=np.inf, help="seconds of the reference's training in a cell")
     parser.add_argument("--output", type=Path, default=Path("output"))
     arguments = parser.parse_args()
-    arguments.every = 1
     if arguments.quick:
         arguments.cells, arguments.conditions, arguments.methods = ["landmarks-2"], ["exact"], ["adjoint"]
         arguments.settings, arguments.updates, arguments.epochs = ["nothing"], 20, 1

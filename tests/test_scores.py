@@ -463,7 +463,7 @@ def test_the_singular_part_of_a_network(key):
     here, doubled = (
         network(t, c * x, v, theta) - network.network(t, c * x / length, v, theta) / length for c in (1, 2)
     )
-    gain = np.asarray(here)[0, 0] * 0.11 / np.asarray(x)[0, 0]
+    gain = np.asarray(here)[1, 0] * 0.11 / np.asarray(x)[1, 0]
     assert abs(gain) > 1e-3
     np.testing.assert_allclose(here, gain * x / 0.11, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(doubled, 2 * here, rtol=1e-6, atol=1e-9)
