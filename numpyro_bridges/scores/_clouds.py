@@ -21,7 +21,7 @@ from .._linalg import apply, cholesky, promote, solve_lower, transpose
 from .._types import State
 from ..bridges import GuidedBridge
 from ..conditioning import ExactMatch, GaussianMessage, whitened_log_density
-from ..guiding import AbstractGuide
+from ..guiding import AbstractGuide, Unguided, default_guide
 from ..sdes import Transition
 from ._reversed import ReversedSDE
 
@@ -64,8 +64,7 @@ def adjoint_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None) 
 def reversal_cloud(bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray, size: int, rho=None) -> Cloud:
     """h(t, ·) of a bridge, at points of its conditioned paths: time reversals, led to x0 by a guide of their own."""
     key_start, key_path, key = jr.split(key, 3)
-    shape = (size, *bridge.noise_shape)
-    ends = jax.vmap(lambda z: bridge.path(z)[-1])(jr.normal(key_start, shape, bridge.x0.dtype))
+    ends = _ends(bridge, key_start, size)
 
     def path(end, key):
         back = reversed_bridge(bridge, end, guide)
@@ -80,6 +79,19 @@ def reversal_cloud(bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray
         return jnp.zeros((), y.dtype)
 
     return _cloud(bridge, key, paths[-1], lambda times, y, key, given: given, log_pair, no_weight, rho, paths[:-1])
+
+
+def _ends(bridge: GuidedBridge, key: PRNGKeyArray, size: int) -> Array:
+    """End states of the conditioned process: a guide's, resampled by their weights."""
+    seen, v = bridge.end()
+    if seen.exact and seen.operator.ndim == 0:
+        return jnp.broadcast_to(v, (size, *v.shape))
+    if isinstance(bridge.guide, Unguided):  # whose weights would leave few
+        bridge = bridge.with_guide(default_guide(bridge.sde, v))
+    key_noise, key_resample = jr.split(key)
+    noise = jr.normal(key_noise, (size, *bridge.noise_shape), bridge.x0.dtype)
+    ends, log_weights = jax.vmap(lambda z: (bridge.path(z)[-1], bridge.log_weight(z)))(noise)
+    return ends[_systematic(key_resample, jax.nn.softmax(log_weights))]
 
 
 def forward_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None) -> Cloud:
