@@ -55,6 +55,7 @@ def test_mosquito_wings(tmp_path):
         assert (tmp_path / "output" / name).stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_learned_vs_guided(tmp_path):
     pytest.importorskip("ktch")
     pytest.importorskip("matplotlib")
