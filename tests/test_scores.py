@@ -21,7 +21,7 @@ from helpers import exact_affine
 import numpyro_bridges as nb
 from numpyro_bridges.guiding._score import Standard
 from numpyro_bridges.scores import ScoreGuide, _training as training_module
-from numpyro_bridges.scores._clouds import adjoint_cloud, forward_cloud, reversal_cloud, reversed_bridge
+from numpyro_bridges.scores._clouds import _ends, adjoint_cloud, forward_cloud, reversal_cloud, reversed_bridge
 from numpyro_bridges.scores._fit import Problem, residual
 from numpyro_bridges.scores._reversed import ReversedSDE
 from numpyro_bridges.scores._training import train
@@ -131,6 +131,18 @@ def test_targets_are_scores_on_average(model, method):
         print(gap, error)
         assert np.all(error < 0.015)
         assert np.all(np.abs(gap) < 3 * error + 0.02)
+
+
+@pytest.mark.parametrize("guide", [nb.Unguided(), nb.FrozenGuide(nb.BrownianMotion(1.5))], ids=["unguided", "wrong"])
+def test_end_states_are_those_of_the_conditioned_process(guide):
+    """A normal posterior, whatever the guide: prior N(0, 0.5), observed with variance 0.1."""
+    match = nb.InexactMatch(0.1).at([1.0])
+    bridge = nb.GuidedBridge(nb.BrownianMotion(0.5), match, x0=[0.0], t1=1.0, num_steps=3, guide=guide)
+    ends = np.asarray(jax.jit(lambda key: _ends(bridge, key, 20000))(jr.key(0)))[:, 0]
+    variance = 0.5 * 0.1 / 0.6
+    error = np.sqrt(variance / 5000)  # an ESS of at least a quarter
+    assert error < 0.005 and abs(ends.mean() - 0.5 / 0.6) < 4 * error
+    np.testing.assert_allclose(ends.var(), variance, rtol=0.08)
 
 
 def test_rho_takes_the_noise_from_the_targets():
