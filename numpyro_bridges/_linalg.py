@@ -68,6 +68,11 @@ def diagonal_matrix(d: Structured, n: int) -> Structured:
     return jnp.where(jnp.eye(n, dtype=bool), d if d.ndim == 0 else d[:, None], 0.0)
 
 
+def diagonal(A: Structured, n: int) -> Structured:
+    """The diagonal `(n,)` of a map."""
+    return jnp.broadcast_to(A, (n,)) if A.ndim < 2 else jnp.diagonal(A)
+
+
 def promote(A: Structured, ndim: int, n: int) -> Structured:
     """The same map with at least the given rank, `n` being the size of the state."""
     if A.ndim == 0 and ndim >= 1:

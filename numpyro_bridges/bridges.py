@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ._checks import as_float, concrete, require, require_finite, require_instance
 from ._linalg import apply, congruence, full_precision, promote
 from ._types import RealScalar, State
-from .conditioning import AbstractCondition, Observation, Target
+from .conditioning import AbstractCondition, GaussianMessage, Observation, Target
 from .guiding import (
     AbstractGuide,
     GridNoise,
@@ -228,21 +228,22 @@ class GuidedBridge(eqx.Module):
         return self._target(jnp.zeros((0,))).value
 
     @full_precision
-    def _message(self, t, x: State, observed: State):
-        """The guide's forecast of what is seen from x at the grid time at or below t."""
+    def _forecast(self, t, x: State, observed: State) -> tuple[GaussianMessage, State]:
+        """The guide's forecast of what is seen from x at the grid time at or below t, and what it adds to its score."""
         seen, reference = self.end()
         if not self._is_discrete:
             auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
-            return exact_message(auxiliary, seen, t, self.ts[-1], x, observed)
+            return exact_message(auxiliary, seen, t, self.ts[-1], x, observed), jnp.zeros_like(x)
         plan = self.guide.plan(self.sde, seen, reference, self.ts)
         k = GridNoise(ts=self.ts, noise=self.x0).index(t)
-        return plan.message(jax.tree.map(lambda a: a[k], plan.steps), self.sde, self.ts[k], x, observed)
+        step = jax.tree.map(lambda a: a[k], plan.steps)
+        return plan.message(step, self.sde, self.ts[k], x, observed), plan.correction(step, x)
 
     def _target(self, extra) -> Target:
         seen = self.condition.observation(self.sde, self.x0)
         if extra.shape[0] == 0:
             return self.condition.target(self.x0, jnp.ones(()), extra)
-        message = self._message(self.ts[0], self.x0, jnp.zeros_like(apply(seen.operator, self.x0)))
+        message, _ = self._forecast(self.ts[0], self.x0, jnp.zeros_like(apply(seen.operator, self.x0)))
         return self.condition.target(apply(message.operator, self.x0) + message.shift, message.factor, extra)
 
     def _before_the_end(self, t, x) -> State:
@@ -260,7 +261,7 @@ class GuidedBridge(eqx.Module):
         """log h̃(t, x) of the guide, t before t1: log density of the datum, or log probability of the set, from x."""
         x = self._before_the_end(t, x)
         seen = self.condition.observation(self.sde, x)
-        message = self._message(t, x, jnp.zeros_like(apply(seen.operator, x)))
+        message, _ = self._forecast(t, x, jnp.zeros_like(apply(seen.operator, x)))
         return self.condition.log_value(apply(message.operator, x) + message.shift, message.factor) + seen.log_scale
 
     @_pure_method
@@ -271,19 +272,12 @@ class GuidedBridge(eqx.Module):
         """
         x = self._before_the_end(t, x)
         seen = self.condition.observation(self.sde, x)
-        message = self._message(t, x, jnp.zeros_like(apply(seen.operator, x)))
+        message, correction = self._forecast(t, x, jnp.zeros_like(apply(seen.operator, x)))
 
         def log_h(y):
             return self.condition.log_value(apply(message.operator, y) + message.shift, message.factor)
 
-        return jax.grad(log_h)(x) + self._correction(t, x)
-
-    def _correction(self, t, x: State) -> State:
-        if not self._is_discrete:
-            return jnp.zeros_like(x)
-        plan = self.guide.plan(self.sde, *self.end(), self.ts)
-        k = GridNoise(ts=self.ts, noise=self.x0).index(t)
-        return plan.correction(jax.tree.map(lambda a: a[k], plan.steps), x)
+        return jax.grad(log_h)(x) + correction
 
     @eqx.filter_jit
     @full_precision
@@ -324,7 +318,7 @@ class GuidedBridge(eqx.Module):
             observed = self.observed()
         z = retrace(self.sde, plan, seen, self.ts, path, observed, key)
         if self.condition.num_extra_noises:
-            message = self._message(self.ts[0], self.x0, jnp.zeros_like(observed))
+            message, _ = self._forecast(self.ts[0], self.x0, jnp.zeros_like(observed))
             mean = apply(message.operator, self.x0) + message.shift
             row = self.condition.noise_from_target(mean, message.factor, observed)
             row = jnp.pad(row, [(0, 0), (0, z.shape[1] - row.shape[1])] + [(0, 0)] * (z.ndim - 2))

@@ -21,8 +21,8 @@ from helpers import exact_affine
 import numpyro_bridges as nb
 from numpyro_bridges.guiding._score import Standard
 from numpyro_bridges.scores import ScoreGuide, _training as training_module
-from numpyro_bridges.scores._clouds import _ends, adjoint_cloud, forward_cloud, reversal_cloud, reversed_bridge
-from numpyro_bridges.scores._fit import Problem, residual
+from numpyro_bridges.scores._clouds import adjoint_cloud, ends, forward_cloud, reversal_cloud, reversed_bridge
+from numpyro_bridges.scores._fit import Problem, adjoint, residual
 from numpyro_bridges.scores._reversed import ReversedSDE
 from numpyro_bridges.scores._training import train
 from numpyro_bridges.sdes import AbstractSDE
@@ -138,11 +138,11 @@ def test_end_states_are_those_of_the_conditioned_process(guide):
     """A normal posterior, whatever the guide: prior N(0, 0.5), observed with variance 0.1."""
     match = nb.InexactMatch(0.1).at([1.0])
     bridge = nb.GuidedBridge(nb.BrownianMotion(0.5), match, x0=[0.0], t1=1.0, num_steps=3, guide=guide)
-    ends = np.asarray(jax.jit(lambda key: _ends(bridge, key, 20000))(jr.key(0)))[:, 0]
+    found = np.asarray(jax.jit(lambda key: ends(bridge, key, 20000))(jr.key(0)))[:, 0]
     variance = 0.5 * 0.1 / 0.6
     error = np.sqrt(variance / 5000)  # an ESS of at least a quarter
-    assert error < 0.005 and abs(ends.mean() - 0.5 / 0.6) < 4 * error
-    np.testing.assert_allclose(ends.var(), variance, rtol=0.08)
+    assert error < 0.005 and abs(found.mean() - 0.5 / 0.6) < 4 * error
+    np.testing.assert_allclose(found.var(), variance, rtol=0.08)
 
 
 def test_rho_takes_the_noise_from_the_targets():
@@ -263,13 +263,13 @@ class Affine(eqx.Module):
         return self.p[0] + self.p[1] * x
 
 
-def residual_loss(bridge, network, batch_size):
-    """What `method="residual"` minimises."""
+def loss_of(method, bridge, network, batch_size):
+    """What a method minimises."""
     found = []
     shape = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
     guide = ScoreGuide(bridge.guide, network, plain_standard(shape))
     training = nb.scores.Training(batch_size=batch_size)
-    residual(Problem(lambda key: bridge, False, guide, training, lambda _, loss, *rest: found.append(loss)), jr.key(0))
+    method(Problem(lambda key: bridge, False, guide, training, lambda _, loss, *rest: found.append(loss)), jr.key(0))
     return found[0]
 
 
@@ -288,9 +288,23 @@ def test_an_exact_guide_has_no_gradient(key):
     for sde, small in ((nb.BrownianMotion(np.array([0.5, 0.2])), True), (nb.LinearSDE(-0.5, 0.4, 0.3), False)):
         guide = nb.FrozenGuide(nb.BrownianMotion(np.array([0.5, 0.2])))
         bridge = nb.GuidedBridge(sde, nb.ExactMatch().at([0.3, 0.1]), x0=[0.0, 0.2], t1=1.0, num_steps=4, guide=guide)
-        gradient, _, arrays = gradient_and_loss(residual_loss(bridge, network, 3), network)
+        gradient, _, arrays = gradient_and_loss(loss_of(residual, bridge, network, 3), network)
         largest = max(float(jnp.max(jnp.abs(g))) for g in jax.tree.leaves(jax.jit(gradient)(arrays, key)))
         assert largest < 1e-12 if small else largest > 1e-3
+
+
+def test_a_learned_guide_can_be_corrected():
+    """Score matching asks for what guide and network together lack: here minus what was put on an exact guide."""
+    bridge = nb.GuidedBridge(nb.BrownianMotion(0.3), nb.ExactMatch().at([0.5]), x0=[0.0], t1=1.0, num_steps=6)
+    added = Affine(jnp.array([0.7, -0.4]))
+    spoilt = bridge.with_guide(ScoreGuide(bridge.guide, added, plain_standard((1, 1))))
+    nothing, opposite = Affine(0 * added.p), Affine(-added.p)
+    noise, right, wrong = (
+        float(loss_of(adjoint, b, network, 8)(network, jr.key(1))[0])
+        for b, network in ((bridge, nothing), (spoilt, opposite), (spoilt, nothing))
+    )
+    np.testing.assert_allclose(right, noise, rtol=1e-10)
+    assert wrong > 2 * noise
 
 
 def test_the_gradient_of_the_bound_is_unbiased():
@@ -300,7 +314,7 @@ def test_the_gradient_of_the_bound_is_unbiased():
         nb.LinearSDE(-1.0, 0.7, 0.5), nb.ExactMatch().at([0.9]), x0=[0.2], t1=1.0, num_steps=6, guide=guide
     )
     network, h = Affine(jnp.array([0.3, -0.4])), 1e-4
-    gradient, value, arrays = gradient_and_loss(residual_loss(bridge, network, 500), network)
+    gradient, value, arrays = gradient_and_loss(loss_of(residual, bridge, network, 500), network)
 
     def both(key):
         moved = [value(Affine(arrays.p + s * d), key) for d in h * np.eye(2) for s in (1.0, -1.0)]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray
 
 from .._checks import as_float, concrete, require, require_finite, require_instance, require_positive
-from .._linalg import apply, cholesky, columns, congruence, solve_lower
+from .._linalg import apply, cholesky, columns, congruence, diagonal, solve_lower
 from .._types import State, Structured
 from ..sdes import AbstractSDE
 from ..spaces import AbstractSpace
@@ -192,7 +192,7 @@ class InexactMatch(AbstractMatch):
         factor = self._factor(sde, x)
         operator = self.operator.astype(x.dtype)
         m = operator.shape[0] if operator.ndim == 2 else x.shape[0]
-        rows = jnp.full((m,), 0.5 * _LOG_2PI, x.dtype) + jnp.log(_diagonal(factor, m))
+        rows = jnp.full((m,), 0.5 * _LOG_2PI, x.dtype) + jnp.log(diagonal(factor, m))
         if self.mask is not None:
             require(
                 self.mask.shape == (m,) and factor.ndim < 2,
@@ -215,10 +215,6 @@ class InexactMatch(AbstractMatch):
             "`normalised=False` is a kernel and no density of what is sampled, so it cannot be a likelihood: "
             "use `normalised=True` here, and `normalised=False` with `GuidedBridge` and `estimate_evidence`.",
         )
-
-
-def _diagonal(factor: Structured, m: int) -> Array:
-    return jnp.broadcast_to(factor, (m,)) if factor.ndim < 2 else jnp.diagonal(factor)
 
 
 def _operator(operator) -> Structured:

@@ -13,12 +13,11 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import require, require_instance
-from .._linalg import apply, transpose
+from .._linalg import apply, diagonal, transpose
 from .._types import Noise, State, Structured
 from ..conditioning import GaussianMessage
 from ..spaces import Landmarks
@@ -79,7 +78,7 @@ class ScoreGuide(AbstractGuide):
       times the weights of the space, is s.
     - `standard`: how its input is standardised.
     - `context`: `context(sde)`, the parameters that the network sees, `(c,)`; `None` if it was trained for one SDE.
-    - `history`: of the training: `step`, `loss`, `bound` (E log w held out), `ess` (of it, a fraction), `seconds`.
+    - `history`: of the training: `update`, `loss`, `bound` (E log w held out), `ess` (of it, a fraction), `seconds`.
     - `held`: a copy of the network with its gradient stopped, in training: the gradient of log w by the network is then
       by the path alone (Roeder, Wu and Duvenaud 2017), which has no noise where the guide is perfect.
     """
@@ -107,7 +106,7 @@ class ScoreGuide(AbstractGuide):
         base = self.guide.plan(sde, seen, reference, ts)
         n, dtype = reference.shape[0], reference.dtype
         weights = jnp.ones(n, dtype) if sde.space is None else sde.space.weights.astype(dtype)
-        a = jnp.broadcast_to(_diagonal(sde.covariance(ts[-1], reference)), (n,))
+        a = diagonal(sde.covariance(ts[-1], reference), n)
         unit = weights * jnp.sqrt(jnp.sum(weights) / jnp.sum(weights * a) / self.standard.duration)
         pooled = isinstance(sde.space, Landmarks)
         theta = jnp.zeros(0, dtype)
@@ -166,13 +165,8 @@ class _UnguidedPlan(AbstractPlan):
     operator: Structured
 
     def steer(self, step, transition, dt, x, observed):
-        zero = jax.eval_shape(lambda: apply(transpose(transition.factor), x))
-        return DriftSteering(jnp.zeros(zero.shape, zero.dtype))
+        return DriftSteering(jnp.zeros_like(apply(transpose(transition.factor), x)))
 
     def message(self, step, sde, t, x, observed):
         one = jnp.ones((), x.dtype)
         return GaussianMessage(self.operator, jnp.zeros_like(observed), one, observed, 0 * one)
-
-
-def _diagonal(a):
-    return jnp.diagonal(a) if a.ndim == 2 else a

@@ -14,7 +14,6 @@ iteration on belong to an interval that was cut off, and are written anew.
 import copy
 import hashlib
 import json
-import os
 import sys
 import warnings
 from functools import partial
@@ -31,6 +30,7 @@ from numpyro.util import is_prng_key, nested_attrgetter
 from tqdm.auto import tqdm
 
 from .._checks import positive_integer, require
+from .._files import write_whole
 from ._posterior import noise_sites, sites_of
 
 
@@ -282,16 +282,7 @@ def _draws_file(folder, begin):
 
 
 def _write(file, arrays) -> None:
-    """All of a file or nothing, also on a disk that loses its power."""
-    with open(file.with_suffix(".tmp"), "wb") as f:
-        np.savez(f, **arrays)
-        f.flush()
-        os.fsync(f.fileno())
-    os.replace(file.with_suffix(".tmp"), file)
-    if os.name == "posix":
-        directory = os.open(file.parent, os.O_RDONLY)
-        os.fsync(directory)
-        os.close(directory)
+    write_whole(file, lambda f: np.savez(f, **arrays))
 
 
 def _read(file) -> dict:

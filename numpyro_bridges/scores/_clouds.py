@@ -64,13 +64,13 @@ def adjoint_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None) 
 def reversal_cloud(bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray, size: int, rho=None) -> Cloud:
     """h(t, ·) of a bridge, at points of its conditioned paths: time reversals, led to x0 by a guide of their own."""
     key_start, key_path, key = jr.split(key, 3)
-    ends = _ends(bridge, key_start, size)
+    starts = ends(bridge, key_start, size)
 
     def path(end, key):
         back = reversed_bridge(bridge, end, guide)
         return back.path(jr.normal(key, back.noise_shape, end.dtype))
 
-    paths = jnp.moveaxis(jax.vmap(path)(ends, jr.split(key_path, size))[:, ::-1], 1, 0)
+    paths = jnp.moveaxis(jax.vmap(path)(starts, jr.split(key_path, size))[:, ::-1], 1, 0)
 
     def log_pair(times, y, new):
         return log_density(bridge.sde.transition(times[0], times[1], new), y)
@@ -81,7 +81,7 @@ def reversal_cloud(bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray
     return _cloud(bridge, key, paths[-1], lambda times, y, key, given: given, log_pair, no_weight, rho, paths[:-1])
 
 
-def _ends(bridge: GuidedBridge, key: PRNGKeyArray, size: int) -> Array:
+def ends(bridge: GuidedBridge, key: PRNGKeyArray, size: int) -> Array:
     """End states of the conditioned process: a guide's, resampled by their weights."""
     seen, v = bridge.end()
     if seen.exact and seen.operator.ndim == 0:
@@ -90,8 +90,8 @@ def _ends(bridge: GuidedBridge, key: PRNGKeyArray, size: int) -> Array:
         bridge = bridge.with_guide(default_guide(bridge.sde, v))
     key_noise, key_resample = jr.split(key)
     noise = jr.normal(key_noise, (size, *bridge.noise_shape), bridge.x0.dtype)
-    ends, log_weights = jax.vmap(lambda z: (bridge.path(z)[-1], bridge.log_weight(z)))(noise)
-    return ends[_systematic(key_resample, jax.nn.softmax(log_weights))]
+    paths, log_weights = jax.vmap(bridge.path_and_log_weight)(noise)
+    return paths[:, -1][_systematic(key_resample, jax.nn.softmax(log_weights))]
 
 
 def forward_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None) -> Cloud:

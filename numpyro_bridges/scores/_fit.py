@@ -7,6 +7,7 @@
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ from ..conditioning import AbstractCondition
 from ..guiding import AbstractGuide, FrozenGuide, ScoreGuide, Standard, Unguided, default_guide
 from ..sdes import AbstractSDE, BrownianMotion
 from ..spaces import Landmarks
-from ._clouds import Cloud, adjoint_cloud, forward_cloud, reversal_cloud, reversed_bridge, whiten
+from ._clouds import Cloud, adjoint_cloud, ends, forward_cloud, reversal_cloud, reversed_bridge, whiten
 from ._networks import MLP, ROWWISE, PointNetwork, over_batch
 from ._training import Training, train
 
@@ -140,7 +141,7 @@ def residual(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
             key_draw, key_noise = jr.split(key)
             bridge = problem.draw(key_draw)
             held = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, network)
-            guide = _with_network(problem.guide, network, held)
+            guide = replace(problem.guide, network=network, held=held)
             noise = jr.normal(key_noise, bridge.noise_shape, bridge.x0.dtype)
             return -bridge.with_guide(guide).log_weight(noise)
 
@@ -180,8 +181,7 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     def draw_back(key, guide):
         key_draw, key_end = jr.split(key)
         bridge = problem.draw(key_draw)
-        end = bridge.path(jr.normal(key_end, bridge.noise_shape, bridge.x0.dtype))[-1]
-        return reversed_bridge(bridge, end, guide(bridge))
+        return reversed_bridge(bridge, ends(bridge, key_end, 1)[0], guide(bridge))
 
     context = problem.guide.context
     back_context = None if context is None else lambda sde: context(sde.sde)
@@ -208,7 +208,7 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     loss = _regression(problem, cloud, key_pilot_2)
     found = problem.train(problem, loss, _judge(problem, key_judge_2), key_second, "reversal")
     seconds = found.history["seconds"] + reverse.history["seconds"][-1]
-    return eqx.tree_at(lambda g: g.history["seconds"], found, seconds)
+    return replace(found, history=found.history | {"seconds": seconds})
 
 
 def _linearised(bridge: GuidedBridge) -> AbstractGuide:
@@ -225,8 +225,7 @@ METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
 
 def _train(problem: Problem, loss, judge, key, name, *, given, directory, progress, watch) -> ScoreGuide:
     def guide(network, history):
-        base = problem.guide
-        return ScoreGuide(base.guide, network, base.standard, base.context, history)
+        return replace(problem.guide, network=network, history=history)
 
     file = None if directory is None else directory / f"{name.replace(' ', '_')}.eqx"
     network, history = train(
@@ -242,10 +241,6 @@ def _train(problem: Problem, loss, judge, key, name, *, given, directory, progre
         watch=None if watch is None else lambda network, history: watch(name, guide(network, history)),
     )
     return guide(network, history)
-
-
-def _with_network(guide: ScoreGuide, network, held=None) -> ScoreGuide:
-    return ScoreGuide(guide.guide, network, guide.standard, guide.context, guide.history, held)
 
 
 def _regression(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray):
@@ -266,12 +261,12 @@ def _regression(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray)
         bridge = problem.draw(key_draw)
         cloud = make(bridge, key_cloud, -(-size // draws), rho)
         seen, reference = bridge.end()
-        guide = _with_network(problem.guide, network)
-        plan = guide.plan(bridge.sde, seen, reference, bridge.ts)
+        plan = replace(problem.guide, network=network).plan(bridge.sde, seen, reference, bridge.ts)
         observed = bridge.observed()
 
         def lacking(step, t, x, g):
-            return g - plan.message(step, bridge.sde, t, x, observed).score(x)
+            base = plan.base.message(step[0], bridge.sde, t, x, observed).score(x)
+            return g - base - plan.base.correction(step[0], x)
 
         each = jax.vmap(jax.vmap(lacking, (None, None, 0, 0)))
         target = each(plan.steps, bridge.ts[:-1], cloud.x, cloud.score)
@@ -315,7 +310,7 @@ def _judge(problem: Problem, key: PRNGKeyArray):
     def judge(network):
         def one(key):
             key_draw, key_noise = jr.split(key)
-            bridge = problem.draw(key_draw).with_guide(_with_network(problem.guide, network))
+            bridge = problem.draw(key_draw).with_guide(replace(problem.guide, network=network))
             noise = jr.normal(key_noise, (half, *bridge.noise_shape), bridge.x0.dtype)
             log_weights = jax.vmap(bridge.log_weight)(jnp.concatenate([noise, -noise]))
             ess = weights.effective_sample_size(log_weights) / (2 * half)

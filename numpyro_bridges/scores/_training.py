@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import time
 import warnings
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from jaxtyping import Array, PRNGKeyArray
 from tqdm.auto import tqdm
 
 from .._checks import positive_integer, require
+from .._files import write_whole
 
 
 class Training(eqx.Module):
@@ -236,13 +236,14 @@ def _digest(tree: Any) -> str:
 
 
 def _save(file: Path, state: _State, label: dict[str, Any]) -> None:
-    """Whole or not at all: a line that says whose it is, and the leaves."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(".part")
-    with open(part, "wb") as f:
+    """A line that says whose it is, and the leaves."""
+
+    def write(f):
         f.write(json.dumps(label).encode() + b"\n")
         eqx.tree_serialise_leaves(f, state)
-    os.replace(part, file)
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(file, write)
 
 
 def _load(file: Path, state: _State, label: dict[str, Any]) -> _State:
