@@ -91,3 +91,14 @@ def test_energies_add_up():
         rest, energies = energies_of(several, (data,), {}, z, owned)
         assert [energy.shape for energy in energies] == shapes
         np.testing.assert_allclose(rest + sum(map(jnp.sum, energies)), expected, rtol=1e-12)
+
+
+def test_energies_under_scale():
+    """`handlers.scale` multiplies the noise's prior too: what it adds is part of the misfit, and no datum's own."""
+    data, scale = RNG.normal(size=(2, 1)), 2.5
+    scaled = numpyro.handlers.scale(several, scale=scale)
+    z = {"mean": jnp.array(0.4), "wing_noise": RNG.normal(size=(2, 2, 1, 1)), "leg_noise": RNG.normal(size=(2, 1, 1))}
+    prior = sum(np.sum(z[k] ** 2 + np.log(2 * np.pi)) / 2 for k in ("wing_noise", "leg_noise"))
+    whole = potential_energy(numpyro.handlers.seed(several, 0), (data,), {}, z)
+    np.testing.assert_allclose(misfit(scaled, (data,), {}, z), scale * whole - prior, rtol=1e-12)
+    assert driven_by(scaled, (data,), {}, z, ("wing_noise", "leg_noise")) is None

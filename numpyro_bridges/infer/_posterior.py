@@ -57,7 +57,10 @@ class _Nothing(dist.ImproperUniform):
 
 
 class _Split(Messenger):
-    """Takes the prior of the noise, and the likelihoods that it drives, out of a model; keeps the latter."""
+    """Takes the prior of the noise, and the likelihoods that it drives, out of a model; keeps the latter.
+
+    What `handlers.scale` makes of the noise's prior, beyond the prior itself, stays in.
+    """
 
     def __init__(self, fn):
         super().__init__(fn)
@@ -70,7 +73,9 @@ class _Split(Messenger):
         if msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
             log_prob = fn.log_prob(msg["value"])
             self.log_likelihood[msg["name"]] = log_prob if msg["scale"] is None else msg["scale"] * log_prob
-        if is_noise(msg) or log_prob is not None:
+        if is_noise(msg) and msg["scale"] is not None:
+            msg["scale"] = msg["scale"] - 1
+        elif is_noise(msg) or log_prob is not None:
             msg["fn"] = _Nothing(constraints.real, fn.batch_shape, fn.event_shape)
 
 
