@@ -444,6 +444,41 @@ def test_the_best_network_is_kept():
     assert np.all(last != 0) and history["update"][-1] == 30
 
 
+def test_a_network_of_half_the_ess_is_not_kept():
+    """However much better its bound is; and it does not count as a look without a better one."""
+
+    def judge(network):
+        far = jnp.sum(network)
+        ess = jnp.where(far < 0.35, 1.0, jnp.where(far < 0.85, 0.45, jnp.where(far < 1.35, 0.55, jnp.nan)))
+        return far, far, ess
+
+    def loss(network, key):
+        return -jnp.sum(network), network
+
+    def run(most, patience=1):
+        training = nb.scores.Training(most, optimizer=optax.sgd(0.05), interval=1, average=0.0, patience=patience)
+        return trained(training, loss=loss, judge=judge)
+
+    for most, kept in ((3, 0.3), (8, 0.3), (9, 0.9), (13, 1.3), (20, 2.0)):  # what is not known is no objection
+        network, history = run(most)
+        assert float(jnp.sum(network)) == pytest.approx(kept)
+        assert history["update"][-1] == most
+    assert float(jnp.sum(run(8, patience=None)[0])) == pytest.approx(0.8)
+
+
+def test_training_makes_no_more_updates_than_asked(tmp_path):
+    """The last look is after fewer updates than the others, and a resumed training has the same."""
+    training = nb.scores.Training(12, interval=5, optimizer=optax.sgd(0.05), average=0.0, patience=None)
+    counted = lambda network, key: (-jnp.sum(network), network)  # noqa: E731
+    network, history = trained(training, loss=counted, file=tmp_path / "training.eqx")
+    np.testing.assert_array_equal(history["update"], [0, 5, 10, 12])
+    np.testing.assert_allclose(network, 12 * 0.05)
+    np.testing.assert_allclose(history["loss"][1:], [-0.2, -0.7, -1.05])
+    again, history = trained(training, loss=counted, file=tmp_path / "training.eqx")
+    np.testing.assert_array_equal(again, network)
+    np.testing.assert_array_equal(history["update"], [0, 5, 10, 12])
+
+
 def test_training_is_watched():
     """At each look, with the network as it is and the history so far, the start included."""
     seen = []

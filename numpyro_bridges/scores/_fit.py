@@ -119,7 +119,7 @@ def fit(
     problem = Problem(
         draw_bridge,
         draw is not None,
-        _untrained(network, draw_bridge, context, key_pilot),
+        _untrained(network, draw_bridge, context, key_pilot, lambda bridge: bridge.end()[1]),
         training,
         partial(
             _train,
@@ -163,7 +163,7 @@ def adjoint(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
         "Use `method='residual'`.",
     )
     key_judge, key_pilot, key = jr.split(key, 3)
-    loss = _regression(problem, adjoint_cloud, key_pilot)
+    loss = _regression(problem, adjoint_cloud, _coefficients(problem, adjoint_cloud, key_pilot))
     return problem.train(problem, loss, _judge(problem, key_judge), key, "adjoint")
 
 
@@ -183,29 +183,31 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
         bridge = problem.draw(key_draw)
         return reversed_bridge(bridge, ends(bridge, key_end, 1)[0], guide(bridge))
 
-    context = problem.guide.context
-    back_context = None if context is None else lambda sde: context(sde.sde)
-
-    def backwards(guide):
-        draw = partial(draw_back, guide=guide)
-        back = problem._replace(draw=draw, guide=_untrained(problem.guide.network, draw, back_context, key_standard))
-        return back, _regression(back, forward_cloud, key_pilot)
-
+    context, network = problem.guide.context, problem.guide.network
+    start = _untrained(network, problem.draw, context, key_standard, lambda bridge: bridge.x0)
+    start = replace(start, context=None if context is None else lambda sde: context(sde.sde))
     unguided = isinstance(bridge.guide, Unguided)
-    candidates = [backwards(guide) for guide in ([lambda _: Unguided()] if unguided else [_linearised, _driftless])]
-    errors = [float(eqx.filter_jit(loss)(problem.guide.network, key_judge)[0]) for _, loss in candidates]
-    back, loss = candidates[errors.index(min(errors))]
+    draws = [partial(draw_back, guide=g) for g in ([lambda _: Unguided()] if unguided else [_linearised, _driftless])]
+    rho = _coefficients(problem._replace(draw=draws[0]), forward_cloud, key_pilot)
 
-    def judge(network):
-        value = -loss(network, key_judge)[0]
-        return value, value, jnp.full((), jnp.nan)
+    def candidate(draw):
+        back = problem._replace(draw=draw, guide=replace(start, guide=draw(key).guide))
+        loss = _regression(back, forward_cloud, rho)
 
+        @eqx.filter_jit
+        def judge(network):
+            value = -loss(network, key_judge)[0]
+            return value, value, jnp.full((), jnp.nan)
+
+        return back, loss, judge
+
+    back, loss, judge = max(map(candidate, draws), key=lambda found: float(found[2](network)[0]))
     reverse = problem.train(back, loss, judge, key_first, "time reversal")
 
     def cloud(bridge, key, size, rho=None):
         return reversal_cloud(bridge, reverse, key, size, rho)
 
-    loss = _regression(problem, cloud, key_pilot_2)
+    loss = _regression(problem, cloud, _coefficients(problem, cloud, key_pilot_2))
     found = problem.train(problem, loss, _judge(problem, key_judge_2), key_second, "reversal")
     seconds = found.history["seconds"] + reverse.history["seconds"][-1]
     return replace(found, history=found.history | {"seconds": seconds})
@@ -243,18 +245,26 @@ def _train(problem: Problem, loss, judge, key, name, *, given, directory, progre
     return guide(network, history)
 
 
-def _regression(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray):
-    """The loss of score matching, ∫ E |s − (g − ∇log h̃)|²_a dt / T, on clouds; ρ is found first."""
-    size = problem.training.batch_size
-    draws = 4 if problem.amortised else 1
+def _coefficients(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray) -> Array:
+    """ρ of score matching on clouds."""
 
     @jax.jit
-    def coefficient(key):
+    def one(key):
         key_draw, key_cloud = jr.split(key)
         return make(problem.draw(key_draw), key_cloud, 256).rho
 
-    rho = jnp.mean(jnp.stack([coefficient(k) for k in jr.split(key, draws)]), axis=0)
-    rho = jnp.zeros_like(rho) if problem.training.one_step else rho
+    rho = jnp.mean(jnp.stack([one(k) for k in jr.split(key, _draws(problem))]), axis=0)
+    return jnp.zeros_like(rho) if problem.training.one_step else rho
+
+
+def _draws(problem: Problem) -> int:
+    """Problems in a batch of clouds."""
+    return 4 if problem.amortised else 1
+
+
+def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
+    """The loss of score matching, ∫ E |s − (g − ∇log h̃)|²_a dt / T, on clouds."""
+    size, draws = problem.training.batch_size, _draws(problem)
 
     def rows(network, key):
         key_draw, key_cloud = jr.split(key)
@@ -307,6 +317,7 @@ def _judge(problem: Problem, key: PRNGKeyArray):
     draws = 16 if problem.amortised else 1
     half = -(-problem.training.held_out // (2 * draws))
 
+    @eqx.filter_jit
     def judge(network):
         def one(key):
             key_draw, key_noise = jr.split(key)
@@ -326,15 +337,18 @@ def _judge(problem: Problem, key: PRNGKeyArray):
     return judge
 
 
-def _untrained(network, draw, context, key, num_paths: int = 64) -> ScoreGuide:
-    """The guide with its network as it is, standardised on paths of the guide that it corrects."""
+def _untrained(network, draw, context, key, target, num_paths: int = 64) -> ScoreGuide:
+    """The guide with its network as it is, standardised on paths of the guide that it corrects.
+
+    `target(bridge)` is the v of which x − v is the displacement.
+    """
 
     def one(key):
         key_draw, key_noise = jr.split(key)
         bridge = draw(key_draw)
         path = bridge.path(jr.normal(key_noise, bridge.noise_shape, bridge.x0.dtype))
         theta = jnp.zeros(0) if context is None else context(bridge.sde)
-        v = bridge.end()[1]
+        v = target(bridge)
         return path.reshape(*path.shape[:2], -1), v.reshape(v.shape[0], -1), theta
 
     paths, v, theta = jax.jit(jax.vmap(one))(jr.split(key, num_paths))

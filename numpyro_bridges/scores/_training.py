@@ -31,8 +31,8 @@ class Training(eqx.Module):
       gradient's norm clipped to 1.
     - `average`: decay of the exponential average of the iterates, which is what is judged and returned; 0 is none.
     - `interval`: updates between looks at the held-out paths. `held_out`: their number.
-    - `patience`: looks without a better one after which training stops; `None` does not stop and keeps the last network
-      in place of the best.
+    - `patience`: looks without a better bound after which training stops; `None` does not stop and keeps the last
+      network in place of the best.
     - `one_step`: the targets of score matching are those of one step, with all their noise, as was usual.
 
     `Training.published()` is the schedule of Baker et al. (2024).
@@ -91,6 +91,7 @@ class _State(eqx.Module):
     optimizer: Any
     best: Any
     best_value: Array
+    best_ess: Array
     waited: Array
     update: Array
     history: dict[str, Array]
@@ -115,14 +116,15 @@ def train(
 ) -> tuple[Any, dict[str, Array]]:
     """The best network, and the history.
 
-    `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)` a value
-    to be maximised, the bound and the ESS fraction on held-out paths. Update i uses `fold_in(key, i)`: the same key
+    `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)`,
+    compiled, a value to be maximised, the bound and the ESS fraction on held-out paths. A network of a better value
+    is kept unless its ESS is less than half of that of the one kept before: the bound E log w is little moved by large
+    weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the same key
     gives the same network, however often training is resumed from `file`, which is refused where it was written for
     another `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is called at each
     look with the network that was looked at. Seconds are of the updates, compilation apart.
     """
     optimizer, decay = training.optimizer, training.average
-    judge = eqx.filter_jit(judge)
     looks = -(-training.num_updates // training.interval) + 1
     empty = {k: jnp.full(looks, jnp.nan) for k in ("update", "loss", "bound", "ess", "seconds")}
     arrays, static = eqx.partition(network, eqx.is_inexact_array)
@@ -132,6 +134,7 @@ def train(
         optimizer.init(arrays),
         arrays,
         jnp.array(-jnp.inf),
+        jnp.array(jnp.nan),
         jnp.zeros((), int),
         jnp.zeros((), int),
         empty,
@@ -139,8 +142,10 @@ def train(
 
     @eqx.filter_jit
     def advance(state: _State) -> tuple[_State, Array]:
-        def update(carry, i):
-            arrays, average, memory = carry
+        first, last = state.update, jnp.minimum(state.update + training.interval, training.num_updates)
+
+        def update(i, carry):
+            arrays, average, memory, losses = carry
 
             def value(arrays):
                 loss_value, renewed = loss(eqx.combine(arrays, static), jr.fold_in(key, i))
@@ -151,26 +156,29 @@ def train(
                 steps, memory = optimizer.update(gradient, memory, renewed)
                 arrays = optax.apply_updates(renewed, steps)
             average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, average, arrays)
-            return (arrays, average, memory), batch_loss
+            return arrays, average, memory, losses.at[i - first].set(batch_loss)
 
-        start = state.network, state.average, state.optimizer
-        (arrays, average, memory), losses = jax.lax.scan(update, start, state.update + jnp.arange(training.interval))
-        new = (arrays, average, memory, state.update + training.interval)
+        start = state.network, state.average, state.optimizer, jnp.zeros(training.interval)
+        arrays, average, memory, losses = jax.lax.fori_loop(first, last, update, start)
+        new = (arrays, average, memory, last)
         where = lambda s: (s.network, s.average, s.optimizer, s.update)  # noqa: E731
         return eqx.tree_at(where, state, new), losses
 
     def look(state: _State, loss_value, seconds) -> _State:
         value, bound, ess = judge(eqx.combine(state.average, static))
-        better = bool(value > state.best_value) or (training.patience is None and bool(value > -jnp.inf))
-        i = int(state.update) // training.interval
+        higher = bool(value > state.best_value)
+        better = higher and not bool(ess < state.best_ess / 2)
+        better = better or (training.patience is None and bool(value > -jnp.inf))
+        i = -(-int(state.update) // training.interval)
         row = {"update": float(state.update), "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
         return eqx.tree_at(
-            lambda s: (s.best, s.best_value, s.waited, s.history),
+            lambda s: (s.best, s.best_value, s.best_ess, s.waited, s.history),
             state,
             (
                 state.average if better else state.best,
                 jnp.where(better, value, state.best_value),
-                jnp.zeros((), int) if better else state.waited + 1,
+                jnp.where(better, ess, state.best_ess),
+                jnp.zeros((), int) if higher else state.waited + 1,
                 {k: state.history[k].at[i].set(v) for k, v in row.items()},
             ),
         )
@@ -204,12 +212,13 @@ def train(
                 )
                 break
             spent += time.perf_counter() - begin
-            state = look(new, jnp.mean(losses), spent)
+            done = int(new.update) - int(state.update)
+            state = look(new, jnp.sum(losses) / done, spent)
             if file is not None:
                 _save(file, state, label)
-            row = {k: float(v[int(state.update) // training.interval]) for k, v in state.history.items()}
+            row = {k: float(v[-1]) for k, v in rows(state).items()}
             bar.set_postfix_str(f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %")
-            bar.update(training.interval)
+            bar.update(done)
             show(state)
     return eqx.combine(state.best, static), rows(state)
 
