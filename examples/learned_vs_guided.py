@@ -113,8 +113,8 @@ def plot_training(histories):
         "log evidence (guided)", (1.0, log_evidence), (-2, -3), xycoords=("axes fraction", "data"),
         textcoords="offset points", ha="right", va="top", fontsize=8, color="#555555",
     )  # fmt: skip
-    axes[0].set(xlabel="seconds of training, compilation included", ylabel="bound E log w, held out")
-    axes[1].set(xlabel="seconds of training, compilation included", ylabel="ESS, % of held-out paths")
+    axes[0].set(xlabel="seconds of training", ylabel="bound E log w, held out")
+    axes[1].set(xlabel="seconds of training", ylabel="ESS, % of held-out paths")
     axes[1].set_ylim(0, 1.1 * max(100 * float(np.max(history["ess"])) for history in histories.values()))
     axes[1].legend(frameon=False, fontsize=9, loc="lower right")
     for ax in axes:

@@ -6,8 +6,15 @@ the package.
 
 import contextlib
 import itertools
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -273,3 +280,34 @@ def check_bridge(bridge, problem: Problem, key, *, inverse=True, compiled=False,
 def columns_of_path(path) -> Any:
     path = np.asarray(path)
     return path[..., None] if path.ndim == 2 else path
+
+
+def killed_and_ended(file, *arguments, progress: Callable[[], int], num_kills: int, within: float) -> list[int]:
+    """Runs a script, kills it by SIGKILL each time at a random moment after it made progress, then lets it end.
+
+    `progress()`: of what it has written, 0 at first. `within`: seconds after new progress. Returns the progress at each
+    kill.
+    """
+    seed = random.SystemRandom().randrange(2**31)
+    print(f"seed {seed}")
+    rng, done = random.Random(seed), [0]
+    settings = {
+        "JAX_ENABLE_X64": "1",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+        "PYTHONPATH": str(Path(__file__).parents[1]),
+    }
+
+    def start():
+        return subprocess.Popen([sys.executable, file, *map(str, arguments)], env=os.environ | settings)
+
+    for _ in range(num_kills):
+        process = start()
+        while progress() <= done[-1]:
+            assert process.poll() is None, f"it ended before it made progress, after {done}"
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, within))
+        process.send_signal(signal.SIGKILL)
+        assert process.wait(10) == -signal.SIGKILL, f"it ended before it was killed, after {done}"
+        done.append(progress())
+    assert start().wait(120) == 0
+    return done[1:]

@@ -1,15 +1,9 @@
 """`run_checkpointed`: a chain that is killed and started again is the chain that never was."""
 
 import io
-import os
-import random
 import shutil
-import signal
-import subprocess
 import sys
-import time
 import warnings
-from pathlib import Path
 
 import jax
 import jax.random as jr
@@ -17,6 +11,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from helpers import killed_and_ended
 from numpyro.infer import HMC, MCMC, NUTS, BarkerMH, Gibbs
 
 import numpyro_bridges as nb
@@ -287,18 +282,7 @@ def long_run(folder):
 @pytest.mark.parametrize("num_kills", [2, pytest.param(10, marks=pytest.mark.slow)])
 def test_kills(num_kills, tmp_path):
     """By SIGKILL, at random moments of a run that writes all the time."""
-    seed = random.SystemRandom().randrange(2**31)
-    print(f"seed {seed}")
-    rng, folder = random.Random(seed), tmp_path / "run"
-    settings = {
-        "JAX_ENABLE_X64": "1",
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        "PYTHONPATH": str(Path(nb.__file__).parents[1]),
-    }
-    done = [0]
-
-    def start():
-        return subprocess.Popen([sys.executable, __file__, str(folder)], env=os.environ | settings)
+    folder = tmp_path / "run"
 
     def iterations():
         try:
@@ -307,16 +291,8 @@ def test_kills(num_kills, tmp_path):
         except FileNotFoundError:
             return 0
 
-    while len(done) <= num_kills:
-        process = start()
-        while iterations() <= done[-1]:
-            assert process.poll() is None, f"it ended before an interval was complete, after {done}"
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 0.3 / num_kills))
-        process.send_signal(signal.SIGKILL)
-        assert process.wait(10) == -signal.SIGKILL, f"it ended before it was killed, after {done}"
-        done.append(iterations())
-    assert start().wait(120) == 0
+    settings = {"progress": iterations, "num_kills": num_kills, "within": 0.3 / num_kills}
+    done = killed_and_ended(__file__, folder, **settings)
     assert iterations() == 2000 and done == sorted(set(done))
     assert_same(long_run(folder), long_run(tmp_path / "whole"))
 

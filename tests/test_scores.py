@@ -5,6 +5,7 @@ differences, and identities that hold for any density.
 """
 
 import functools
+import sys
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ import optax
 import pytest
 import scipy.linalg
 import scipy.stats
-from helpers import exact_affine
+from helpers import exact_affine, killed_and_ended
 
 import numpyro_bridges as nb
 from numpyro_bridges.guiding._score import Standard
@@ -398,6 +399,30 @@ def test_training_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     assert not np.array_equal(trained(key=1)[0], whole)
 
 
+def long_training(folder):
+    sde, condition = nb.SDE(lambda t, x, a: jnp.sin(x), lambda t, x, a: 0.5), nb.ExactMatch().at(jnp.ones(1))
+    training = nb.scores.Training(600, 4, interval=5, held_out=8, patience=None)
+    settings = {"x0": jnp.zeros(1), "t1": 1.0, "num_steps": 4, "training": training, "progress": False}
+    return nb.scores.fit(sde, condition, key=jr.key(0), directory=folder, **settings)
+
+
+@pytest.mark.parametrize("num_kills", [1, pytest.param(10, marks=pytest.mark.slow)])
+def test_training_survives_kills(num_kills, tmp_path):
+    """By SIGKILL: the parameters and the history are those of an uninterrupted training."""
+    file = tmp_path / "run" / "residual.eqx"
+
+    def written():
+        return file.stat().st_mtime_ns if file.exists() else 0
+
+    killed_and_ended(__file__, file.parent, progress=written, num_kills=num_kills, within=0.3 / num_kills)
+    stamp = written()
+    found, whole = long_training(file.parent), long_training(tmp_path / "whole")
+    assert written() == stamp  # nothing was left to do
+    for guide in (found, whole):
+        guide.history.pop("seconds")
+    jax.tree.map(np.testing.assert_array_equal, eqx.filter(found, eqx.is_array), eqx.filter(whole, eqx.is_array))
+
+
 def test_a_directory_belongs_to_one_training(tmp_path):
     file = tmp_path / "training.eqx"
     trained(file=file, problem={"x0": jnp.zeros(2)})
@@ -704,3 +729,7 @@ def test_the_sine_bridge(method):
     print(method, truth, weight.mean(), error, ess, score.history["bound"])
     assert error < 0.1 and abs(weight.mean() - 1) < 3 * error
     assert ess[1] > 20 * ess[0]
+
+
+if __name__ == "__main__":
+    long_training(sys.argv[1])

@@ -170,7 +170,10 @@ def train(
         better = higher and not bool(ess < state.best_ess / 2)
         better = better or (training.patience is None and bool(value > -jnp.inf))
         i = -(-int(state.update) // training.interval)
+        history = {k: np.array(v) for k, v in state.history.items()}  # NumPy: each length would be another program
         row = {"update": float(state.update), "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
+        for name, number in row.items():
+            history[name][i] = number
         return eqx.tree_at(
             lambda s: (s.best, s.best_value, s.best_ess, s.waited, s.history),
             state,
@@ -179,13 +182,13 @@ def train(
                 jnp.where(better, value, state.best_value),
                 jnp.where(better, ess, state.best_ess),
                 jnp.zeros((), int) if higher else state.waited + 1,
-                {k: state.history[k].at[i].set(v) for k, v in row.items()},
+                {k: jnp.asarray(v) for k, v in history.items()},
             ),
         )
 
     def rows(state: _State) -> dict[str, Array]:
         kept = np.isfinite(np.asarray(state.history["update"]))
-        return {k: v[kept] for k, v in state.history.items()}
+        return {k: jnp.asarray(np.asarray(v)[kept]) for k, v in state.history.items()}
 
     def show(state: _State) -> None:
         if watch is not None:
@@ -216,7 +219,7 @@ def train(
             state = look(new, jnp.sum(losses) / done, spent)
             if file is not None:
                 _save(file, state, label)
-            row = {k: float(v[-1]) for k, v in rows(state).items()}
+            row = {k: float(np.asarray(v)[-1]) for k, v in rows(state).items()}
             bar.set_postfix_str(f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %")
             bar.update(done)
             show(state)
