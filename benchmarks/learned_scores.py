@@ -93,7 +93,7 @@ def ou(arguments):
             start = exact.with_guide(nb.FrozenGuide(nb.BrownianMotion(1.0)))
             mse, relative = score_errors(start, truth, paths, weights)
             show(part="ou", d=d, T=T, method="none", mse=mse, relative=relative)
-            for method in METHODS:
+            for method in arguments.methods:
                 learned, seconds = trained(start, method, arguments.training)
                 mse, relative = score_errors(learned, truth, paths, weights)
                 show(part="ou", d=d, T=T, method=method, mse=mse, relative=relative, seconds=seconds)
@@ -154,7 +154,7 @@ def evidence(arguments):
             continue
         guided = nb.estimate_evidence(bridge, jr.key(2), num_particles=arguments.particles)
         report(name, "guided", guided, guided)
-        for method in methods:
+        for method in (m for m in methods if m in arguments.methods):
             batch = 16 if name == "Kunita 32" and method == "residual" else arguments.training.batch_size
             training = Training(arguments.updates, batch)
             learned, seconds = trained(bridge, method, training)
@@ -225,7 +225,7 @@ def kunita(arguments):
             size += float(jnp.sum(u * (a @ w)))
         return error / size
 
-    for method in ("guided", *METHODS):
+    for method in ("guided", *arguments.methods):
         learned, seconds = (bridge, 0.0) if method == "guided" else trained(bridge, method, arguments.training)
         score = jax.jit(learned.score)
         error = relative(lambda k, x, score=score: score(bridge.ts[k], x))
@@ -346,6 +346,7 @@ if __name__ == "__main__":
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--cases", nargs="+", help="of `evidence`; all by default")
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS, help="of all but two parts")
     parser.add_argument("--updates", type=int, default=1500)
     parser.add_argument("--particles", type=int, default=8192)
     arguments = parser.parse_args()
