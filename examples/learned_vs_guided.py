@@ -33,6 +33,8 @@ import numpyro_bridges as nb
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
+numpyro.set_host_device_count(2)  # two of the four chains on each core
+
 parser = argparse.ArgumentParser()
 parser.add_argument("--quick", action="store_true", help="16 points, 30 steps, two trainings, few updates and draws")
 parser.add_argument("--updates", type=int, default=150, help="of each training")

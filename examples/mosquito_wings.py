@@ -26,6 +26,8 @@ from numpyro.infer import MCMC, Predictive
 
 import numpyro_bridges as nb
 
+numpyro.set_host_device_count(2)  # two of the four chains on each core
+
 parser = argparse.ArgumentParser()
 parser.add_argument("--quick", action="store_true", help="4 specimens, 16 points, few steps and draws")
 parser.add_argument("--genus", default="CX", help="a genus of the data set; CX is Culex")

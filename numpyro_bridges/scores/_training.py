@@ -76,10 +76,12 @@ class Training(eqx.Module):
         self.patience, self.one_step = patience, bool(one_step)
 
     @classmethod
-    def published(cls, num_epochs: int = 100) -> "Training":
+    def published(cls, num_epochs: int = 100, learning_rate: float = 1e-4) -> "Training":
         """Epochs of 40 batches of 50 paths; 500 updates of warm-up, Adam from 1e-4 to 1e-6; one-step targets."""
         total = 40 * positive_integer(num_epochs, "num_epochs")
-        schedule = optax.warmup_cosine_decay_schedule(0.0, 1e-4, min(500, total // 2), total, 1e-6)
+        schedule = optax.warmup_cosine_decay_schedule(
+            0.0, learning_rate, min(500, total // 2), total, 0.01 * learning_rate
+        )
         return cls(total, 50, optimizer=optax.adam(schedule), average=0.0, interval=40, patience=None, one_step=True)
 
 
