@@ -53,7 +53,9 @@ def kernels(model):
     return {
         "nuts": lambda: NUTS(model, init_strategy=init_to_median, dense_mass=dense),
         "nuts-0.65": lambda: NUTS(model, init_strategy=init_to_median, dense_mass=dense, target_accept_prob=0.65),
-        "gibbs-pcn-nuts": lambda: Gibbs([(PCN(model), noise_sites), (NUTS(model, dense_mass=dense), None)]),
+        "gibbs-pcn-nuts": lambda: Gibbs(
+            [(PCN(model), noise_sites), (NUTS(model, init_strategy=init_to_median, dense_mass=dense), None)]
+        ),
         "function-space-hmc": lambda: FunctionSpaceHMC(model),
         "pseudo-marginal": lambda: CorrelatedPseudoMarginal(model),
     }

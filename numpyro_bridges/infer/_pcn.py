@@ -163,7 +163,10 @@ class AbstractPCN(AbstractBridgeKernel):
 class PCN(AbstractPCN):
     """Preconditioned Crank-Nicolson moves of the noise: no gradients.
 
-        Gibbs([(PCN(model, num_moves=3), noise_sites), (NUTS(model), None)])
+        nuts = NUTS(model, init_strategy=init_to_guided_mean)
+        Gibbs([(PCN(model, num_moves=3), noise_sites), (nuts, None)])
+
+    NUTS's own start, uniform values, is far out for parameters of a flow: its steps may stay tiny.
 
     **Arguments:**
 

@@ -60,12 +60,12 @@ class PointNetwork(eqx.Module):
     outer: eqx.nn.Linear
 
     def __init__(
-        self, dim: int, context: int = 0, *, key: PRNGKeyArray, width: int = 32, depth: int = 2, heads: int = 4
+        self, dim: int, context: int = 0, *, key: PRNGKeyArray, width: int = 16, depth: int = 2, heads: int = 2
     ):
         key_in, key_out, *keys = jr.split(key, 2 + 2 * depth)
         self.inner = eqx.nn.Linear(2 * dim + context + 10, width, key=key_in)
         self.values = [eqx.nn.Linear(width, width, key=k) for k in keys[:depth]]
-        self.updates = [eqx.nn.MLP((1 + heads) * width, width, 2 * width, 1, jax.nn.silu, key=k) for k in keys[depth:]]
+        self.updates = [eqx.nn.MLP((1 + heads) * width, width, width, 1, jax.nn.silu, key=k) for k in keys[depth:]]
         self.log_widths = jnp.linspace(jnp.log(0.15), jnp.log(3.0), heads)
         self.outer = _zero(eqx.nn.Linear(width, dim, key=key_out))
 
