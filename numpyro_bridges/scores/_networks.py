@@ -194,7 +194,8 @@ class _Level(eqx.Module):
 class WithState(eqx.Module):
     """A network that keeps state between batches, `network(t, x, v, theta, state)`, as `eqx.nn.make_with_state` gives.
 
-    Called, it is in inference mode.
+    Called, it is in inference mode. Its state is renewed by score matching on one problem; `"residual"`, and `draw`,
+    leave it as it is.
     """
 
     network: Any
