@@ -62,7 +62,7 @@ def test_learned_vs_guided(tmp_path):
     run(str(ROOT / "examples/learned_vs_guided.py"), "--quick", "--output", "output", cwd=tmp_path)
     found = json.loads((tmp_path / "output/learned_vs_guided.json").read_text())
     rows = found["comparison"]
-    assert list(rows) == ["guided", "residual", "adjoint"]
+    assert list(rows) == ["guided", "residual"]
     for row in rows.values():
         joint = (row["standard_error"] ** 2 + rows["guided"]["standard_error"] ** 2) ** 0.5
         assert abs(row["log_evidence"] - rows["guided"]["log_evidence"]) < 4 * joint + 1e-3, row
