@@ -209,7 +209,7 @@ def freeze(file: Path, cells, conditions, epochs, rate: float, budget: float):
 
 def train(cell: Cell, method: str, setting: str, num_updates: int) -> dict:
     """One of ours."""
-    training = nb.scores.Training(num_updates, interval=min(50, num_updates))
+    training = nb.scores.Training(num_updates, interval=min(100, num_updates))
     network = None
     if setting == "nothing":
         key_network, key_gain = jr.split(jr.key(2))

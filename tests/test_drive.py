@@ -1,7 +1,10 @@
 """The derivative by hand of the guided step's hot line, against finite differences."""
 
+import jax
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
+import pytest
 from jax.test_util import check_grads
 
 from numpyro_bridges.guiding._drive import drive
@@ -17,3 +20,22 @@ def test_derivative_of_the_drive(key):
         return drive(A, X @ X.T + jnp.eye(3), Y @ Y.T + jnp.eye(3), r, z)
 
     check_grads(f, arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("over", [3, 4])
+def test_derivative_of_a_batch(key, over):
+    """By what a batch shares: the sum of its examples' derivatives, log determinants that it shares included."""
+    keys = jr.split(key, 6)
+    shapes = (3, 4), (3, 3), (3, 3), (3, 2), (4, 2)
+    A, X, Y, r, z = (jr.normal(k, shape) for k, shape in zip(keys, shapes, strict=False))
+    several = jr.normal(keys[5], (5, *shapes[over]))
+
+    def f(shared, one):
+        u, log_det = drive(*shared, one, z) if over == 3 else drive(*shared, r, one)
+        return jnp.sum(u**2) + log_det
+
+    shared = A, X @ X.T + jnp.eye(3), Y @ Y.T + jnp.eye(3)
+    found = jax.grad(lambda shared: jnp.sum(jax.vmap(f, (None, 0))(shared, several)))(shared)
+    each = [jax.grad(f)(shared, one) for one in several]
+    for gradient, *others in zip(found, *each, strict=True):
+        np.testing.assert_allclose(gradient, sum(others), rtol=1e-9, atol=1e-10)

@@ -35,7 +35,9 @@ def _forward(A, S, M, r, z):
     y = solve_lower(N, r)
     w = solve_lower(N, y - g, transposed=True)
     log_det = jnp.sum(jnp.log(jnp.diagonal(P))) - jnp.sum(jnp.log(jnp.diagonal(N)))
-    return (z + A.T @ w, log_det), (A, N, P, z, y, g, w)
+    u = z + A.T @ w
+    # Under `vmap` both outputs are batched, or neither: a shared one would have its cotangent counted for each example.
+    return (u, log_det + 0 * u[0, 0]), (A, N, P, z, y, g, w)
 
 
 @full_precision
