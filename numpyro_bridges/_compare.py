@@ -224,7 +224,7 @@ def _row(bridge: GuidedBridge, log_weights: np.ndarray, seconds: float, trained:
     ess = float(weights.effective_sample_size(log_weights)) if num_particles > 1 else math.nan
     pareto_k = float(weights.pareto_k(log_weights)) if num_particles > 1 else math.nan
     finite = math.isfinite(log_evidence) and math.isfinite(standard_error)
-    if finite and np.ptp(log_weights) <= rounding:
+    if finite and np.ptp(log_weights) <= 2 * rounding:  # each of two log weights may be off by it
         pareto_k = -math.inf  # and not the shape of the tail of rounding errors
     return {
         "log_evidence": log_evidence,

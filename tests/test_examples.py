@@ -98,7 +98,8 @@ def test_calibration(tmp_path):
     chosen = "--quick --models sine --kernels FunctionSpaceHMC --output output".split()
     out = run(str(ROOT / "benchmarks/calibration.py"), *chosen, cwd=tmp_path)
     (row,) = [json.loads(line) for line in out.splitlines()]
-    assert len(row["largest_over_band"]) == 4 and row["inside"], row
+    # A right kernel leaves the 95 % band of a rank once in 20 runs, and 1.56 times that band once in 4000 (Kolmogorov).
+    assert len(row["largest_over_band"]) == 4 and max(row["largest_over_band"].values()) < 1.56, row
     assert (tmp_path / "output" / "calibration.png").stat().st_size > 5000
 
 
