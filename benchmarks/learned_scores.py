@@ -28,6 +28,7 @@ import jax.random as jr
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from mcmc import seconds_of_a_draw
 
 import numpyro_bridges as nb
 from numpyro_bridges.scores import Training, fit
@@ -334,19 +335,6 @@ def amortised(arguments):
     for site in ("amplitude", "length_scale"):
         (m1, e1), (m2, e2) = posterior["guided", site], posterior["amortised", site]
         show(part="amortised", site=site, difference_in_se=float(abs(m1 - m2) / np.hypot(e1, e2)))
-
-
-def seconds_of_a_draw(kernel, state, *data):
-    """Of all chains. `MCMC.run` compiles anew in every call."""
-
-    @jax.jit
-    def advance(state):
-        return jax.lax.fori_loop(0, 50, lambda _, state: kernel.sample(state, data, {}), state)
-
-    state = jax.block_until_ready(advance(advance(state)))
-    begin = time.perf_counter()
-    jax.block_until_ready(advance(state))
-    return (time.perf_counter() - begin) / 50
 
 
 PARTS = {"ou": ou, "evidence": evidence, "kunita": kunita, "points": points, "amortised": amortised}

@@ -7,7 +7,7 @@
 # scales, and uses it in MCMC over them: the posterior must be the same, since the weights are exact either way.
 #
 #     python examples/learned_vs_guided.py            # some minutes on 2 cores
-#     python examples/learned_vs_guided.py --quick    # about a minute, to see that all runs
+#     python examples/learned_vs_guided.py --quick    # some two minutes, to see that all runs
 
 # %%
 import argparse
@@ -91,7 +91,7 @@ def learn(method):
     return nb.scores.fit(bridge.sde, seen.at(wing), key=key_fit, method=method, network=network, **settings)
 
 
-methods = ("residual",) if quick else ("residual", "adjoint", "reversal")
+methods = ("residual", "adjoint") if quick else ("residual", "adjoint", "reversal")
 guides = {method: learn(method) for method in methods}
 bridges = {"guided": bridge} | {method: bridge.with_guide(guide) for method, guide in guides.items()}
 comparison = nb.compare(bridges, key_compare, num_particles=num_particles)

@@ -62,7 +62,7 @@ def test_learned_vs_guided(tmp_path):
     run(str(ROOT / "examples/learned_vs_guided.py"), "--quick", "--output", "output", cwd=tmp_path)
     found = json.loads((tmp_path / "output/learned_vs_guided.json").read_text())
     rows = found["comparison"]
-    assert list(rows) == ["guided", "residual"]
+    assert list(rows) == ["guided", "residual", "adjoint"]
     for row in rows.values():
         joint = (row["standard_error"] ** 2 + rows["guided"]["standard_error"] ** 2) ** 0.5
         assert abs(row["log_evidence"] - rows["guided"]["log_evidence"]) < 4 * joint + 1e-3, row
@@ -98,8 +98,7 @@ def test_calibration(tmp_path):
     chosen = "--quick --models sine --kernels FunctionSpaceHMC --output output".split()
     out = run(str(ROOT / "benchmarks/calibration.py"), *chosen, cwd=tmp_path)
     (row,) = [json.loads(line) for line in out.splitlines()]
-    # A right kernel leaves the 95 % band of a rank once in 20 runs, and 1.56 times that band once in 4000 (Kolmogorov).
-    assert len(row["largest_over_band"]) == 4 and max(row["largest_over_band"].values()) < 1.56, row
+    assert len(row["largest_over_band"]) == 4 and row["inside"], row
     assert (tmp_path / "output" / "calibration.png").stat().st_size > 5000
 
 

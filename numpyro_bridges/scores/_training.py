@@ -77,12 +77,16 @@ class Training(eqx.Module):
 
     @classmethod
     def published(cls, num_epochs: int = 100, learning_rate: float = 1e-4) -> "Training":
-        """Epochs of 40 batches of 50 paths; 500 updates of warm-up, Adam from 1e-4 to 1e-6; one-step targets."""
+        """Epochs of 40 batches of 50 paths; 500 updates of warm-up, Adam; one-step targets.
+
+        The rate falls to a hundredth of `learning_rate`, which is 1e-4 as published.
+        """
         total = 40 * positive_integer(num_epochs, "num_epochs")
         schedule = optax.warmup_cosine_decay_schedule(
             0.0, learning_rate, min(500, total // 2), total, 0.01 * learning_rate
         )
-        return cls(total, 50, optimizer=optax.adam(schedule), average=0.0, interval=40, patience=None, one_step=True)
+        settings = {"average": 0.0, "interval": 40, "patience": None, "one_step": True}
+        return cls(total, 50, learning_rate=learning_rate, optimizer=optax.adam(schedule), **settings)
 
 
 class _State(eqx.Module):
@@ -121,10 +125,10 @@ def train(
     `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)`,
     compiled, a value to be maximised, the bound and the ESS fraction on held-out paths. A network of a better value
     is kept unless its ESS is less than half of that of the one kept before: the bound E log w is little moved by large
-    weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the same key
-    gives the same network, however often training is resumed from `file`, which is refused where it was written for
-    another `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is called at each
-    look with the network that was looked at. Seconds are of the updates, compilation apart.
+    weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the same key gives the same network,
+    however often training is resumed from `file`, which is refused where it was written for another `problem` (a pytree
+    of arrays), another key or other settings. `watch(network, history)` is called at each look with the network that
+    was looked at. Seconds are of the updates, compilation apart.
     """
     optimizer, decay = training.optimizer, training.average
     looks = -(-training.num_updates // training.interval) + 1
