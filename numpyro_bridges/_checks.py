@@ -1,11 +1,56 @@
-"""Checks of what a user passes: the argument in backticks, the rule, the value got, the cure."""
+"""Checks of what a user passes: the argument in backticks, the rule, the value got, the cure.
 
-from typing import Any
+A number is decided by its kind and never by what a conversion makes of it: NumPy parses text, counts days since 1970,
+takes True for 1 and None for NaN, and JAX drops imaginary parts and masks, all without a word.
+"""
+
+import datetime
+import operator
+import reprlib
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+
+_CURES = {
+    "boolean": "True and False are no numbers: where 1 and 0 are meant, `float(value)` or `.astype(float)`.",
+    "text": "Convert text first: `float(text)`, or `numpy.asarray(texts, float)`.",
+    "time": (
+        "Give times and dates as numbers, such as days since the first: "
+        "`(times - times[0]) / numpy.timedelta64(1, 'D')`."
+    ),
+    "complex": "Give its real part, or real and imaginary parts as coordinates of their own.",
+    "none": "None is not a number: was something left out?",
+    "masked": "Some of its entries are masked: fill them in, or leave them out.",
+    "ragged": "Its rows must all have one length: a set of different shapes is a list of arrays, one call for each.",
+    "key": "A random key is no number: draw some with it, `jax.random.normal(key, shape)`.",
+    "other": "Give a number, or an array of numbers such as `numpy.asarray(value, float)`.",
+}
+"""What to do about a value, by its kind."""
+
+_DTYPES: dict[Any, str | None] = {  # a time difference is an integer to NumPy: its row comes first
+    jnp.bool_: "boolean",
+    np.character: "text",
+    np.datetime64: "time",
+    np.timedelta64: "time",
+    jnp.complexfloating: "complex",
+    jax.dtypes.prng_key: "key",
+    jnp.floating: None,
+    jnp.integer: None,
+}
+
+_TYPES: dict[tuple[type, ...], str] = {
+    (bool,): "boolean",
+    (str, bytes): "text",
+    (datetime.date, datetime.time, datetime.timedelta): "time",
+    (complex,): "complex",
+    (type(None),): "none",
+}
+
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = _short.maxlong = 80
 
 
 def concrete(x: Any) -> np.ndarray | None:
@@ -13,18 +58,109 @@ def concrete(x: Any) -> np.ndarray | None:
     return None if isinstance(x, Tracer) else np.asarray(x)
 
 
-def as_float(x: Any, name: str) -> jax.Array:
-    """An array of the default float type; `ValueError` for what is no number."""
+def words(value: Any) -> str:
+    """A value as an error shows it: on one line, an array by its type and shape."""
+    dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    if dtype is not None and isinstance(shape, tuple) and (shape or isinstance(value, Tracer)):
+        return f"an array of {dtype} of shape {shape}"
     try:
-        return jnp.asarray(x, float)
-    except (TypeError, ValueError) as e:
-        raise ValueError(f"`{name}` must be a number or an array of numbers; got {x!r}.") from e
+        return " ".join(_short.repr(value).split())
+    except Exception:  # a class may raise anything, an integer of thousands of digits does
+        return object.__repr__(value)
+
+
+def as_float(x: Any, name: str) -> jax.Array:
+    """An array of the default float type; `ValueError` for what is no real number or array of them."""
+    return _converted(_real(x, name), jnp.result_type(float), name)
 
 
 def floating(x: Any, name: str) -> jax.Array:
     """An array that keeps its precision; whole numbers become the default float type."""
-    keeps = jnp.issubdtype(getattr(x, "dtype", int), jnp.floating)
-    return jnp.asarray(x) if keeps else as_float(x, name)
+    x = _real(x, name)
+    keeps = jnp.issubdtype(x.dtype, jnp.floating) and (isinstance(x, jax.Array) or x.itemsize < 8)
+    return jnp.asarray(x) if keeps else _converted(x, jnp.result_type(float), name)
+
+
+def known_float(x: Any, name: str) -> np.ndarray:
+    """A NumPy array of double precision, for what is prepared outside traced programs."""
+    x = _real(x, name)
+    require(
+        not isinstance(x, Tracer),
+        f"`{name}` must be known before tracing; got {words(x)}. Call this outside `jax.jit` and `jax.vmap`.",
+    )
+    return np.asarray(x, float)
+
+
+def _real(x: Any, name: str) -> jax.Array | np.ndarray:
+    """x as an array of a real type, its own where it has one."""
+    kind = _kind(x)
+    if kind is not None:
+        _refuse(x, name, kind)
+    try:
+        if any(isinstance(leaf, Tracer) for leaf in _leaves(x)):
+            return x if isinstance(x, Tracer) else jnp.asarray(x, float)
+        if isinstance(x, jax.Array):
+            return x
+        array = np.asarray(x)
+        return array.astype(float) if array.dtype == object else array
+    except OverflowError as e:
+        raise ValueError(
+            f"`{name}` must be a number; got {words(x)}, which is too large for one."
+        ) from e
+    except (TypeError, ValueError) as e:
+        _refuse(x, name, "ragged", e)
+
+
+def _refuse(x: Any, name: str, kind: str, cause: Exception | None = None) -> NoReturn:
+    raise ValueError(
+        f"`{name}` must be a number or an array of numbers; got {words(x)}. {_CURES[kind]}"
+    ) from cause
+
+
+def _leaves(x: Any):
+    if isinstance(x, (list, tuple)):
+        for item in x:
+            yield from _leaves(item)
+    else:
+        yield x
+
+
+def _kind(x: Any) -> str | None:
+    """What x is, if no real number and no array of them: a key of `_CURES`."""
+    if isinstance(x, (list, tuple)):
+        return next((kind for kind in map(_kind, x) if kind is not None), None)
+    for types, kind in _TYPES.items():
+        if isinstance(x, types):
+            return kind
+    if isinstance(x, (int, float)):
+        return None
+    if np.ma.is_masked(x):
+        return "masked"
+    if not isinstance(x, (jax.Array, np.ndarray, np.generic)):
+        try:
+            x = np.asarray(x)
+        except Exception:  # what a foreign `__array__` raises
+            return "other"
+    if x.dtype == object:
+        return _kind(x.tolist()) if x.ndim else "other"
+    return next(
+        (kind for dtype, kind in _DTYPES.items() if jnp.issubdtype(x.dtype, dtype)), "other"
+    )
+
+
+def _converted(x: jax.Array | np.ndarray, dtype: Any, name: str) -> jax.Array:
+    """x in another precision; `ValueError` for a finite number that would become infinite."""
+    if isinstance(x, jax.Array):
+        return jnp.asarray(x, dtype)
+    with np.errstate(over="ignore"):
+        converted = x.astype(dtype)
+    lost = np.isinf(converted) & np.isfinite(x)
+    if np.any(lost):
+        raise ValueError(
+            f"`{name}` must fit into {dtype}; got {x[lost][0]}, which would be infinite. Choose other units, or "
+            'double precision: `jax.config.update("jax_enable_x64", True)`.'
+        )
+    return jnp.asarray(converted)
 
 
 def require(ok: Any, message: str) -> None:
@@ -33,16 +169,46 @@ def require(ok: Any, message: str) -> None:
         raise ValueError(message)
 
 
-def positive_integer(value: Any, name: str) -> int:
-    """A static size."""
-    good = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
-    require(good, f"`{name}` must be a positive integer; got {value!r}. It is known before tracing.")
-    return int(value)
+def positive_integer(value: Any, name: str, least: int = 1) -> int:
+    """A static size of at least `least`; any integer type will do, and no boolean."""
+    kind = "a positive integer" if least == 1 else f"an integer, at least {least}"
+    message = f"`{name}` must be {kind}; got {words(value)}. It is known before tracing."
+    require(not isinstance(value, bool), message)
+    try:
+        size = operator.index(value)
+    except TypeError as e:
+        raise ValueError(message) from e
+    require(size >= least, message)
+    require(size < 2**31, f"`{name}` must be below 2³¹; got {words(value)}.")
+    return size
 
 
-def require_instance(value: Any, kind: type, name: str, cure: str) -> None:
+def flag(value: Any, name: str) -> bool:
+    """True or False, and nothing that is merely true or false to Python, such as the text "False"."""
+    require(
+        isinstance(value, (bool, np.bool_)),
+        f"`{name}` must be True or False; got {words(value)}. It is known before tracing.",
+    )
+    return bool(value)
+
+
+def require_key(key: Any, name: str = "key") -> None:
+    """One random key, `jax.random.key(0)` or the raw `jax.random.PRNGKey(0)`."""
+    message = f"`{name}` must be a random key, such as `jax.random.key(0)`; got {words(key)}."
+    require(isinstance(key, (jax.Array, np.ndarray)), message)
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    if not typed:
+        raw = jax.eval_shape(jax.random.PRNGKey, 0)
+        require(key.dtype == raw.dtype and key.shape[-1:] == raw.shape, message)
+    require(
+        key.ndim == (0 if typed else 1),
+        f"`{name}` must be one random key; got {words(key)}, several. Use vmap over them, or one of them, `keys[0]`.",
+    )
+
+
+def require_instance(value: Any, kind: type | tuple[type, ...], name: str, cure: str) -> None:
     """The value is of a class, whose name says what is meant."""
-    require(isinstance(value, kind), f"`{name}` must be {cure}; got {value!r}.")
+    require(isinstance(value, kind), f"`{name}` must be {cure}; got {words(value)}.")
 
 
 def require_finite(x: jax.Array, name: str, cure: str = "") -> None:
@@ -50,7 +216,9 @@ def require_finite(x: jax.Array, name: str, cure: str = "") -> None:
     value = concrete(x)
     if value is not None and not np.all(np.isfinite(value)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(value))[0])
-        raise ValueError(f"`{name}` must be finite; entry {where} is {value[where]}. {cure}".rstrip())
+        raise ValueError(
+            f"`{name}` must be finite; entry {where} is {value[where]}. {cure}".rstrip()
+        )
 
 
 def require_positive(x: jax.Array, name: str, cure: str = "") -> None:
