@@ -5,8 +5,12 @@ takes True for 1 and None for NaN, and JAX drops imaginary parts and masks, all 
 """
 
 import datetime
+import math
 import operator
 import reprlib
+from collections.abc import Callable, Iterable
+from os import PathLike, fspath
+from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
@@ -190,6 +194,40 @@ def flag(value: Any, name: str) -> bool:
         f"`{name}` must be True or False; got {words(value)}. It is known before tracing.",
     )
     return bool(value)
+
+
+def known_number(
+    value: Any,
+    name: str,
+    rule: str = "a finite number",
+    ok: Callable[[float], bool] = math.isfinite,
+) -> float:
+    """A finite setting that is known before tracing and meets a rule, which is given in words too."""
+    number = known_float(value, name)
+    require(
+        number.ndim == 0 and np.isfinite(number) and ok(float(number)),
+        f"`{name}` must be {rule}; got {words(value)}.",
+    )
+    return float(number)
+
+
+def choice(value: Any, name: str, options: Iterable[str], cure: str = "") -> str:
+    """One of a few names."""
+    options = list(options)
+    require(
+        isinstance(value, str) and value in options,
+        f"`{name}` must be one of {', '.join(map(repr, options))}; got {words(value)}. {cure}".rstrip(),
+    )
+    return value
+
+
+def as_path(value: Any, name: str) -> Path:
+    """A path; a number would be an open file, and an empty text the working directory."""
+    require(
+        isinstance(value, (str, PathLike)) and isinstance(fspath(value), str) and value != "",
+        f"`{name}` must be a path, text or a `pathlib.Path`; got {words(value)}.",
+    )
+    return Path(value)
 
 
 def require_key(key: Any, name: str = "key") -> None:
