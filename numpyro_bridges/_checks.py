@@ -164,7 +164,8 @@ def _converted(x: jax.Array | np.ndarray, dtype: Any, name: str) -> jax.Array:
             f"`{name}` must fit into {dtype}; got {x[lost][0]}, which would be infinite. Choose other units, or "
             'double precision: `jax.config.update("jax_enable_x64", True)`.'
         )
-    return jnp.asarray(converted)
+    with jax.ensure_compile_time_eval():  # what is known stays known while a program is traced
+        return jnp.asarray(converted)
 
 
 def require(ok: Any, message: str) -> None:

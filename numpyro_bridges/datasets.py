@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ._checks import known_float, positive_integer, words
 from .shapes import procrustes_align, resample
 
 
@@ -50,15 +51,14 @@ def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
 
     **Raises:** `ImportError` without `ktch`, `ValueError` for a genus that is not there.
     """
-    if num_points < 3:
-        raise ValueError(f"`num_points` must be at least 3 for an outline, got {num_points}.")
+    num_points = positive_integer(num_points, "num_points", least=3)
     folder = _ktch_data() / "outline_mosquito_wings"
     with open(folder / "meta_outline_mosquito_wings.csv", encoding="utf-8", newline="") as file:
         genera = {row["specimen_id"]: row["genus"] for row in csv.DictReader(file)}
-    chosen = [specimen for specimen, its in genera.items() if genus in (None, its)]
+    chosen = [specimen for specimen, its in genera.items() if genus is None or str(genus) == its]
     if not chosen:
         available = ", ".join(f"{name!r} ({count})" for name, count in Counter(genera.values()).most_common())
-        raise ValueError(f"`genus` must be one of {available}, or None for all; got {genus!r}.")
+        raise ValueError(f"`genus` must be one of {available}, or None for all; got {words(genus)}.")
     specimen, _, *xy = np.loadtxt(folder / "data_outline_mosquito_wings.csv", delimiter=",", skiprows=1, unpack=True)
     outlines = [np.stack(xy, axis=1)[specimen == int(name)] for name in chosen]
     labels = tuple(genera[name] for name in chosen)
@@ -80,14 +80,14 @@ def ellipses(num_points: int = 32, aspects: Sequence[float] = (1.0, 1.25, 1.5, 2
 
     **Returns:** `Shapes`.
     """
-    if num_points < 3:
-        raise ValueError(f"`num_points` must be at least 3 for an outline, got {num_points}.")
-    if len(aspects) == 0 or min(aspects) <= 0.0:
-        raise ValueError(f"`aspects` must be one or more positive ratios, got {tuple(aspects)}.")
+    num_points = positive_integer(num_points, "num_points", least=3)
+    ratios = known_float(aspects, "aspects")
+    if ratios.ndim != 1 or ratios.size == 0 or not np.all(np.isfinite(ratios) & (ratios > 0.0)):
+        raise ValueError(f"`aspects` must be one or more positive ratios, got {words(aspects)}.")
     angles = np.linspace(0.0, 2.0 * np.pi, 100 * num_points, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    labels = tuple(f"{aspect:g}" for aspect in aspects)
-    points = [resample(circle * [aspect, 1.0], num_points) for aspect in aspects]
+    labels = tuple(f"{aspect:g}" for aspect in ratios)
+    points = [resample(circle * [aspect, 1.0], num_points) for aspect in ratios]
     return _in_register(points, labels, tuple(f"ellipse {label}" for label in labels))
 
 

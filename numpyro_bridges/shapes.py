@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._checks import flag, known_float, known_number, positive_integer
+
 
 def resample(points: ArrayLike, num_points: int, closed: bool = True) -> NDArray:
     """Points at equal arc length along a polygon, beginning at its first point.
@@ -26,10 +28,8 @@ def resample(points: ArrayLike, num_points: int, closed: bool = True) -> NDArray
 
     **Raises:** `ValueError` for missing (NaN) points, a curve of no length, or too few points.
     """
-    points = _shape(points, "points")
-    fewest = 1 if closed else 2
-    if num_points < fewest:
-        raise ValueError(f"`num_points` must be at least {fewest} on this curve, got {num_points}.")
+    points, closed = _shape(points, "points"), flag(closed, "closed")
+    num_points = positive_integer(num_points, "num_points", least=1 if closed else 2)
     if closed:
         points = np.concatenate([points, points[:1]])
     arc_length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -41,7 +41,7 @@ def resample(points: ArrayLike, num_points: int, closed: bool = True) -> NDArray
 
 def center(points: ArrayLike) -> NDArray:
     """Shapes (..., n, d) moved so that the mean of their points is the origin."""
-    points = _seen(np.asarray(points, dtype=float), "points")
+    points = _shapes(points, "points")
     return points - points.mean(axis=-2, keepdims=True)
 
 
@@ -106,9 +106,14 @@ def procrustes_align(
     **Raises:** `ValueError` for a wrong shape, a shape with fewer than d seen points, or no shape to begin
     from.
     """
-    shapes = np.asarray(shapes, dtype=float)
+    scale = flag(scale, "scale")
+    max_iterations = positive_integer(max_iterations, "max_iterations")
+    tolerance = known_number(tolerance, "tolerance", "a number from 0 on", lambda value: value >= 0)
+    shapes = known_float(shapes, "shapes")
     if shapes.ndim != 3 or shapes.shape[-1] not in (2, 3) or 0 in shapes.shape:
         raise ValueError(f"`shapes` must have the shape (N, n, 2) or (N, n, 3), got {shapes.shape}.")
+    if np.any(np.isinf(shapes)):
+        raise ValueError("`shapes` must be finite, or NaN where a point is missing; got infinite coordinates.")
     _, num_points, dim = shapes.shape
     missing: NDArray = np.any(np.isnan(shapes), axis=-1)
     num_seen = num_points - missing.sum(axis=1)
@@ -165,9 +170,11 @@ def align_start(shapes: ArrayLike, reference: ArrayLike) -> NDArray:
     **Returns:** the shapes with their points in the new order, not moved otherwise.
     """
     reference = center(_shape(reference, "reference"))
-    shapes = _seen(np.asarray(shapes, dtype=float), "shapes")
-    if shapes.shape[-2:] != reference.shape:
-        raise ValueError(f"`shapes` must end in the reference's shape {reference.shape}, got {shapes.shape}.")
+    shapes = _shapes(shapes, "shapes")
+    if shapes.shape[-2:] != reference.shape or shapes.ndim > 3:
+        raise ValueError(
+            f"`shapes` must be one or several of the reference's shape {reference.shape}, got {shapes.shape}."
+        )
     n = len(reference)
     shifts = (np.arange(n)[:, None] + np.arange(n)) % n
 
@@ -200,9 +207,16 @@ def _fill(shapes: NDArray, missing: NDArray, mean: NDArray) -> NDArray:
 
 
 def _shape(points: ArrayLike, name: str) -> NDArray:
-    points = np.asarray(points, dtype=float)
+    points = known_float(points, name)
     if points.ndim != 2 or points.shape[-1] not in (2, 3) or len(points) == 0:
         raise ValueError(f"`{name}` must have the shape (n, 2) or (n, 3), got {points.shape}.")
+    return _seen(points, name)
+
+
+def _shapes(points: ArrayLike, name: str) -> NDArray:
+    points = known_float(points, name)
+    if points.ndim < 2 or 0 in points.shape:
+        raise ValueError(f"`{name}` must have the shape (..., n, d), got {points.shape}.")
     return _seen(points, name)
 
 

@@ -90,7 +90,7 @@ def test_ellipses():
 
 @pytest.mark.parametrize("make", [datasets.mosquito_wings, datasets.ellipses])
 def test_too_few_points(make):
-    with pytest.raises(ValueError, match="`num_points` must be at least 3 for an outline, got 2"):
+    with pytest.raises(ValueError, match="`num_points` must be an integer, at least 3; got 2"):
         make(num_points=2)
 
 

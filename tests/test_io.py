@@ -262,7 +262,7 @@ class TestWriteCsv:
 
     def test_errors(self, tmp_path):
         path, one, two = tmp_path / "a.csv", Specimen(np.ones((1, 2))), Specimen(np.ones((2, 2)))
-        with pytest.raises(ValueError, match='`layout` must be "wide" or "long", got \'tall\''):
+        with pytest.raises(ValueError, match="`layout` must be one of 'wide', 'long'; got 'tall'"):
             write_csv(path, [one], layout="tall")
         with pytest.raises(ValueError, match="at least one specimen"):
             write_csv(path, [])

@@ -175,7 +175,7 @@ def test_score_frames_errors(flows):
     line = nb.GuidedBridge(
         nb.BrownianMotion(1.0), nb.InexactMatch(0.1).at([1.0, 2.0]), x0=[0.0, 1.0], t1=1.0, num_steps=2
     )
-    with pytest.raises(ValueError, match=r"`points of paths` must have the shape \(T, q, 2\), got \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"`paths` must have the shape \(T, q, 2\), got \(1, 2\)"):
         plot.score_frames(line, np.zeros((3, 2)), 0.0, "never.png")
 
 

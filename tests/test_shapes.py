@@ -69,7 +69,7 @@ class TestResample:
             (np.zeros((2, 4, 2)), 3, r"shape \(n, 2\) or \(n, 3\), got \(2, 4, 2\)"),
             (np.zeros((4, 4)), 3, r"got \(4, 4\)"),
             (np.zeros((0, 2)), 3, r"got \(0, 2\)"),
-            (np.eye(2), 0, "`num_points` must be at least 1 .* got 0"),
+            (np.eye(2), 0, "`num_points` must be a positive integer; got 0"),
         ],
     )
     def test_errors(self, points, num_points, message):

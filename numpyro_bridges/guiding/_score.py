@@ -9,14 +9,14 @@ z + √dt σᵀ s before it is guided, and the log weight gains log N(z + √dt 
 the network says (Yang, van der Meulen and Sommer 2025).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._checks import require, require_instance
+from .._checks import require, require_instance, words
 from .._linalg import apply, diagonal, transpose
 from .._types import Noise, State, Structured
 from ..conditioning import GaussianMessage
@@ -92,7 +92,12 @@ class ScoreGuide(AbstractGuide):
 
     def __check_init__(self):
         require_instance(self.guide, AbstractGuide, "guide", "a guide, such as `RecedingGuide()`")
-        require(callable(self.network), f"`network` must be a function (t, x, v, theta); got {self.network!r}.")
+        require(callable(self.network), f"`network` must be a function (t, x, v, theta); got {words(self.network)}.")
+        require_instance(self.standard, Standard, "standard", "a `Standard`, which `numpyro_bridges.scores.fit` makes")
+        for name, function in (("context", self.context), ("held", self.held)):
+            good = function is None or callable(function)
+            require(good, f"`{name}` must be a function, or None; got {words(function)}.")
+        require_instance(self.history, Mapping, "history", "a dictionary of arrays")
 
     def check(self, sde, x):
         self.guide.check(sde, x)

@@ -12,7 +12,8 @@ from os import PathLike
 
 import numpy as np
 
-from ._specimen import Specimen, fail, number, open_text, read_text, text
+from .._checks import choice, require, words
+from ._specimen import Specimen, as_specimens, fail, number, open_text, read_text, text
 
 _MISSING = ("", "na", "nan")
 
@@ -44,6 +45,9 @@ def read_csv(
 
     **Raises:** `ValueError` with file, line number, what was expected and what was found, for anything else.
     """
+    for name, value in (("id", id), ("point", point)):
+        require(isinstance(value, str), f"`{name}` must be the name of a column; got {words(value)}.")
+    _check_delimiter(delimiter)
     content = read_text(path, encoding, newline="")
     reader = csv.reader(io.StringIO(content, newline=""), delimiter=delimiter)
     header = [name.strip() for name in next(reader, [])]
@@ -93,9 +97,9 @@ def write_csv(
     **Raises:** `ValueError` for specimens that do not fit one table, and for curves, images and scales, which
     have no column.
     """
-    specimens = list(specimens)
-    if layout not in ("wide", "long"):
-        raise ValueError(f'`layout` must be "wide" or "long", got {layout!r}.')
+    specimens = as_specimens(specimens)
+    choice(layout, "layout", ("wide", "long"))
+    _check_delimiter(delimiter)
     _check_table(specimens, layout)
     shape, notes = specimens[0].landmarks.shape, list(specimens[0].notes)
     axes = "xyz"[: shape[1]]
@@ -169,9 +173,12 @@ def _in_order(path: str | PathLike, group: _Rows, point: str) -> _Rows:
     return [(line, row) for _, line, row in numbered]
 
 
+def _check_delimiter(delimiter: str) -> None:
+    good = isinstance(delimiter, str) and len(delimiter) == 1 and delimiter not in '\r\n"'
+    require(good, f"`delimiter` must be one character; got {words(delimiter)}.")
+
+
 def _check_table(specimens: list[Specimen], layout: str) -> None:
-    if not specimens:
-        raise ValueError("`specimens` must hold at least one specimen, got none.")
     first = specimens[0]
     columns = slice(None) if layout == "wide" else slice(1, None)
     for i, specimen in enumerate(specimens):

@@ -1,13 +1,16 @@
 """One specimen as files hold it, and what the readers of all formats share."""
 
+import codecs
 import gzip
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike, fspath
 from typing import NoReturn, TextIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .._checks import as_path, known_float, known_number, require, require_instance, words
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +33,23 @@ class Specimen:
     notes: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
-        object.__setattr__(self, "landmarks", np.asarray(self.landmarks, dtype=float))
-        object.__setattr__(self, "curves", tuple(np.asarray(curve, dtype=float) for curve in self.curves))
+        require(
+            isinstance(self.curves, (list, tuple)),
+            f"`curves` must be a tuple of arrays (n, d); got {words(self.curves)}.",
+        )
+        curves = tuple(known_float(curve, f"curves[{j}]") for j, curve in enumerate(self.curves))
+        object.__setattr__(self, "curves", curves)
+        object.__setattr__(self, "landmarks", known_float(self.landmarks, "landmarks"))
+        if self.scale is not None:
+            scale = known_number(self.scale, "scale", "a positive number, or None", lambda value: value > 0)
+            object.__setattr__(self, "scale", scale)
+        for name in ("id", "image"):
+            value = getattr(self, name)
+            require(value is None or isinstance(value, str), f"`{name}` must be text, or None; got {words(value)}.")
+        require(
+            isinstance(self.notes, Mapping) and all(isinstance(x, str) for item in self.notes.items() for x in item),
+            f"`notes` must be text by key, texts both; got {words(self.notes)}.",
+        )
         shape = self.landmarks.shape
         if len(shape) != 2 or shape[1] not in (2, 3):
             raise ValueError(f"`landmarks` must have the shape (n, 2) or (n, 3), got {shape}.")
@@ -42,6 +60,11 @@ class Specimen:
 
 def open_text(path: str | PathLike, mode: str, encoding: str, newline: str | None = None) -> TextIO:
     """A text file, compressed where its name ends in `.gz`."""
+    path = as_path(path, "path")
+    try:
+        codecs.lookup(encoding)
+    except (LookupError, TypeError, ValueError) as error:
+        raise ValueError(f"`encoding` must be the name of one, such as 'utf-8'; got {words(encoding)}.") from error
     if fspath(path).endswith(".gz"):
         return cast(TextIO, gzip.open(path, f"{mode}t", encoding=encoding, newline=newline))
     return cast(TextIO, open(path, mode, encoding=encoding, newline=newline))
@@ -57,6 +80,19 @@ def read_text(path: str | PathLike, encoding: str, newline: str | None = None) -
             f"{fspath(path)}: expected text in the encoding {encoding!r}, found byte "
             f"{error.object[error.start]:#04x}. Pass its `encoding`, such as 'cp1252' on Windows."
         ) from error
+
+
+def as_specimens(specimens: Iterable[Specimen]) -> list[Specimen]:
+    """At least one, as a list."""
+    require(
+        isinstance(specimens, Iterable) and not isinstance(specimens, str),
+        f"`specimens` must be a list of `Specimen`; got {words(specimens)}.",
+    )
+    specimens = list(specimens)
+    for i, specimen in enumerate(specimens):
+        require_instance(specimen, Specimen, f"specimens[{i}]", "a `Specimen`")
+    require(bool(specimens), "`specimens` must hold at least one specimen, got none.")
+    return specimens
 
 
 def fail(path: str | PathLike, line: int, expected: str, found: str, cure: str) -> NoReturn:

@@ -23,7 +23,8 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from ._specimen import Specimen, fail, number, open_text, read_text, text
+from .._checks import flag
+from ._specimen import Specimen, as_specimens, fail, number, open_text, read_text, text
 
 _BLOCKS = {"LM": 2, "LM3": 3}
 _FIELDS = {"IMAGE": "image", "ID": "id", "SCALE": "scale"}
@@ -51,6 +52,7 @@ def read_tps(path: str | PathLike, *, negative_is_missing: bool = False, encodin
 
     **Raises:** `ValueError` with file, line number, what was expected and what was found, for anything else.
     """
+    negative_is_missing = flag(negative_is_missing, "negative_is_missing")
     lines = _Lines(path, read_text(path, encoding))
     if lines.current is None:
         fail(path, 1, "LM= or LM3=", "an empty file", "Export the file again.")
@@ -68,9 +70,7 @@ def write_tps(path: str | PathLike, specimens: Iterable[Specimen], *, encoding: 
     **Raises:** `ValueError` where a text would not read back: line breaks (except in notes), blanks at its
     ends, a note whose key has a meaning in the format.
     """
-    lines = [line for specimen in specimens for line in _format(specimen)]
-    if not lines:
-        raise ValueError("`specimens` must hold at least one specimen, got none.")
+    lines = [line for specimen in as_specimens(specimens) for line in _format(specimen)]
     with open_text(path, "w", encoding, newline="\n") as file:
         file.write("\n".join(lines) + "\n")
 

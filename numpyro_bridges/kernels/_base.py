@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ._parameters import positive_scalar, scalar, squared_distances
+from ._parameters import point, positive_scalar, scalar, squared_distances
 
 
 class AbstractKernel(eqx.Module):
@@ -48,7 +48,7 @@ class AbstractKernel(eqx.Module):
 
     def __call__(self, x: Float[Array, " dim"], y: Float[Array, " dim"]) -> Float[Array, ""]:
         """k(x, y) of two points."""
-        return self.matrix(jnp.asarray(x)[None], jnp.asarray(y)[None])[0, 0]
+        return self.matrix(point(x, "x")[None], point(y, "y")[None])[0, 0]
 
     def __add__(self, other: "AbstractKernel") -> "AbstractKernel":
         if not isinstance(other, AbstractKernel):

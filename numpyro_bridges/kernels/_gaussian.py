@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._checks import positive_integer
 from ._base import AbstractKernel, AbstractRadialKernel
 from ._parameters import positive_scalar, squared_frequency
 
@@ -31,10 +32,11 @@ class GaussianKernel(AbstractRadialKernel):
         """
         if not isinstance(other, GaussianKernel):
             raise ValueError(
-                "a `GaussianKernel` has a closed convolution with another one only; got "
+                "`other` must be a `GaussianKernel` too, or there is no closed convolution; got "
                 f"{type(other).__name__}. Give the covariance itself (`covariance=`), or a "
                 "`QuadratureCovariance`."
             )
+        dim = positive_integer(dim, "dim")
         alpha, ell = self.scales()
         beta, m = other.scales(alpha.dtype)
         width = jnp.hypot(ell, m)

@@ -7,6 +7,7 @@ In the scaling r = |x - y| / length_scale, without the factor √(2ν) of much o
 
 from functools import partial
 from math import exp, factorial, lgamma, log, pi
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,8 +15,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .._checks import positive_integer, require
 from ._base import AbstractKernel, AbstractRadialKernel
 from ._parameters import positive_scalar, squared_frequency
+
+_MAX_ORDER = 1000
+"""The polynomial is written out, one term for each order."""
 
 
 def _coefficients(p: int) -> list[float]:
@@ -52,6 +57,16 @@ def _(p, primals, tangents):
     return _matern(p, s), slope * ds
 
 
+def _order(value: Any) -> int:
+    order = positive_integer(value, "order", least=0)
+    require(
+        order <= _MAX_ORDER,
+        f"`order` must be at most {_MAX_ORDER}; got {order}. Smoothness is ν = order + 1/2; a limit of large "
+        "orders is `GaussianKernel`.",
+    )
+    return order
+
+
 class MaternKernel(AbstractRadialKernel):
     """k(x, y) = amplitude · M_order(r), r = |x - y| / length_scale, of smoothness ν = order + 1/2.
 
@@ -64,22 +79,16 @@ class MaternKernel(AbstractRadialKernel):
 
     amplitude: Float[Array, ""] = eqx.field(converter=positive_scalar("amplitude"))
     length_scale: Float[Array, ""] = eqx.field(converter=positive_scalar("length_scale"))
-    order: int = eqx.field(static=True, default=4)
-
-    def __check_init__(self):
-        if not isinstance(self.order, int) or self.order < 0:
-            raise ValueError(
-                f"`order` must be an integer from 0 on; got {self.order!r}. Smoothness is ν = order + 1/2; "
-                "a limit of large orders is `GaussianKernel`."
-            )
+    order: int = eqx.field(static=True, default=4, converter=_order)
 
     def profile(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         return _matern(self.order, s)
 
     def convolved_with(self, other: AbstractKernel, dim: int) -> "MaternKernel":
         """With itself, in odd dimensions: order 2 · order + (dim + 1)/2 and the same length scale."""
+        dim = positive_integer(dim, "dim")
         if other is not self or dim % 2 == 0:
-            what = f"in dimension {dim}" if other is self else f"with another kernel, {type(other).__name__}"
+            what = f"in dimension {dim}" if other is self else f"with an `other`, {type(other).__name__}"
             raise ValueError(
                 f"a `MaternKernel` has a closed convolution with itself in odd dimensions only; got one "
                 f"{what}. Give the covariance itself (`covariance=`), or a `QuadratureCovariance`."

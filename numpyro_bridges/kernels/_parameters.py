@@ -6,7 +6,7 @@ from functools import reduce
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import as_float, floating, require, require_positive
+from .._checks import as_float, floating, positive_integer, require, require_positive
 
 
 def scalar(value: Array, name: str, dtype: jnp.dtype) -> Float[Array, ""]:
@@ -35,6 +35,16 @@ def positive_scalar(name: str) -> Callable[[ArrayLike], Float[Array, ""]]:
     return convert
 
 
+def point(x: ArrayLike, name: str) -> Float[Array, " dim"]:
+    """One point."""
+    x = floating(x, name)
+    require(
+        x.ndim == 1,
+        f"`{name}` must be of shape (dim,); got shape {x.shape}. Many points are for `matrix`, a batch for `jax.vmap`.",
+    )
+    return x
+
+
 def points(x: ArrayLike, name: str) -> Float[Array, "n dim"]:
     """Points, one a row."""
     x = floating(x, name)
@@ -58,6 +68,7 @@ def squared_distances(x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Flo
 
 def squared_frequency(omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
     """|ω|² of frequency vectors, the last axis being that of space."""
+    dim = positive_integer(dim, "dim")
     omega = floating(omega, "omega")
     require(
         omega.ndim > 0 and omega.shape[-1] == dim,

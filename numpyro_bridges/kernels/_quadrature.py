@@ -2,13 +2,22 @@
 
 from collections.abc import Sequence
 from math import prod
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import as_float, concrete, require, require_finite
+from .._checks import (
+    as_float,
+    concrete,
+    positive_integer,
+    require,
+    require_finite,
+    require_instance,
+    words,
+)
 from ._base import AbstractKernel
 
 
@@ -32,11 +41,12 @@ class QuadratureCovariance(AbstractKernel):
     num_cells: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, kernel: AbstractKernel, lower: ArrayLike, upper: ArrayLike, num_cells: int | Sequence[int]):
+        require_instance(kernel, AbstractKernel, "kernel", "a kernel, such as `MaternKernel(amplitude, length_scale)`")
         self.kernel = kernel
         self.lower, self.upper = as_float(lower, "lower"), as_float(upper, "upper")
         shape = self.lower.shape
         require(
-            len(shape) == 1 and self.upper.shape == shape,
+            len(shape) == 1 and shape[0] > 0 and self.upper.shape == shape,
             "`lower` and `upper` must be corners of a box, two arrays of shape (dim,); got shapes "
             f"{shape} and {self.upper.shape}.",
         )
@@ -45,11 +55,14 @@ class QuadratureCovariance(AbstractKernel):
         low, high = concrete(self.lower), concrete(self.upper)
         if low is not None and high is not None and not np.all(low < high):
             raise ValueError(f"`lower` must lie below `upper` on every axis; got {low} and {high}.")
-        self.num_cells = tuple(num_cells) if isinstance(num_cells, Sequence) else (num_cells,) * shape[0]
+        cells: Any = num_cells
+        several = isinstance(cells, Sequence) or getattr(cells, "ndim", 0) > 0
+        per_axis = list(cells) if several else [cells] * shape[0]
         require(
-            len(self.num_cells) == shape[0] and all(isinstance(c, int) and c > 0 for c in self.num_cells),
-            f"`num_cells` must be a positive integer, or one for each of {shape[0]} axes; got {num_cells!r}.",
+            len(per_axis) == shape[0],
+            f"`num_cells` must be a positive integer, or one for each of {shape[0]} axes; got {words(num_cells)}.",
         )
+        self.num_cells = tuple(positive_integer(number, "num_cells") for number in per_axis)
 
     @property
     def cell_volume(self) -> Float[Array, ""]:

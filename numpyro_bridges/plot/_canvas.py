@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._checks import as_path, known_float, require, words
+
 START, TARGET, ACCENT, NEUTRAL = "#003f5c", "#d55e00", "#0072b2", "#8a8a8a"
 
 
@@ -22,6 +24,10 @@ def shape_axes(ax: Any, points: NDArray, size: float = 5.0) -> Any:
     One unit is as long in x as in y.
     """
     plt = pyplot()
+    require(
+        ax is None or hasattr(ax, "add_collection"),
+        f"`ax` must be axes of matplotlib, such as `plt.subplots()[1]`; got {words(ax)}.",
+    )
     if ax is None:
         extent = np.ptp(seen(points), axis=0)
         figsize = size * np.maximum(extent / extent.max(), 0.05) + 0.3
@@ -59,18 +65,26 @@ def time_map() -> Any:
 
 
 def as_times(ts: ArrayLike | None, num_times: int) -> NDArray:
-    times = np.linspace(0.0, 1.0, num_times) if ts is None else np.asarray(ts, dtype=float)
+    times = np.linspace(0.0, 1.0, num_times) if ts is None else known_float(ts, "ts")
     if times.shape != (num_times,):
         raise ValueError(f"`ts` must have the shape ({num_times},), one time for each state, got {times.shape}.")
+    require(np.all(np.isfinite(times)), f"`ts` must be finite; got {times}.")
     return times
 
 
 def as_points(points: ArrayLike, name: str, *shapes: str) -> NDArray:
     """An array of one of the shapes written as text, such as "(n, 2)"."""
-    points = np.asarray(points, dtype=float)
+    points = known_float(points, name)
     if points.ndim not in [shape.count(",") + 1 for shape in shapes] or points.shape[-1] != 2:
         raise ValueError(
             f"`{name}` must have the shape {' or '.join(shapes)}, got {points.shape}. "
             "Of shapes in space draw two coordinates: points[..., :2]."
         )
+    if not len(seen(points)):
+        raise ValueError(f"`{name}` must have a point that is not missing, got none of {points.shape}.")
     return points
+
+
+def as_file(file: Any, name: str) -> Any:
+    """Where a figure is written to: a path, or a binary file that is open."""
+    return file if hasattr(file, "write") else as_path(file, name)

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ._canvas import ACCENT, NEUTRAL, START, pyplot
+from ._canvas import ACCENT, NEUTRAL, START, as_file, pyplot
 
 
 def draw_comparison(rows: Mapping[str, Mapping[str, float | bool]], path: Any) -> Any:
     """The rows of a `Comparison` as three panels, written to a file; the `Figure`, closed."""
-    plt = pyplot()
+    plt, path = pyplot(), as_file(path, "path")
     size = (8.0, 1.0 + 0.42 * len(rows))
     figure, axes = plt.subplots(1, 3, figsize=size, sharey=True, layout="constrained", width_ratios=[1.4, 1, 1.2])
     colors = [START if row["trusted"] else NEUTRAL for row in rows.values()]

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._checks import known_float, known_number, require, words
 from ._canvas import ACCENT, START, TARGET, pyplot
 
 
@@ -32,7 +33,17 @@ def posterior(
 
     **Returns:** the list of filled areas, one for each parameter in order.
     """
-    draws = {name: np.asarray(value, dtype=float) for name, value in samples.items() if np.ndim(value) == 1}
+    for name, given in (("samples", samples), ("prior", prior or {}), ("truth", truth or {})):
+        require(
+            isinstance(given, Mapping) and all(isinstance(key, str) for key in given),
+            f"`{name}` must be a dictionary of draws or values by name; got {words(given)}.",
+        )
+    level = known_number(level, "level", "a probability in (0, 1)", lambda value: 0 < value < 1)
+    draws = {}
+    for name, value in samples.items():
+        if getattr(value, "ndim", 1) == 1:
+            values = known_float(value, f"samples[{name!r}]")
+            draws |= {name: values} if values.ndim == 1 and values.size else {}
     if not draws:
         raise ValueError("`samples` must hold at least one scalar parameter, an entry of shape (S,).")
     for name, values in draws.items():
@@ -49,7 +60,11 @@ def posterior(
         grids = [_grid(values, 0.001)]
         curves = [_density(values, grids[0])]
         if prior is not None and name in prior:
-            before = np.ravel(np.asarray(prior[name], dtype=float))
+            before = np.ravel(known_float(prior[name], f"prior[{name!r}]"))
+            require(
+                before.size > 0 and np.all(np.isfinite(before)),
+                f"`prior[{name!r}]` must be draws, finite numbers; got {words(prior[name])}.",
+            )
             grids.append(_grid(before, 0.1))
             curves.append(_density(before, grids[1]))
             ax.plot(grids[1], curves[1], color="#555555", linewidth=1.2, linestyle=(0, (4, 2)), zorder=3)
@@ -68,7 +83,7 @@ def posterior(
         )
         ax.plot(middle, 0.0, "o", color="white", markeredgecolor=START, markersize=6, clip_on=False, zorder=5)
         if truth is not None and name in truth:
-            ax.axvline(truth[name], color=TARGET, linewidth=1.4, zorder=2)
+            ax.axvline(known_number(truth[name], f"truth[{name!r}]"), color=TARGET, linewidth=1.4, zorder=2)
         ax.set(xlabel=name, yticks=[], ylim=(0.0, 1.08 * max(curve.max() for curve in curves)))
         ax.set_xlim(min(grid[0] for grid in grids), max(grid[-1] for grid in grids))
         ax.spines[["left", "top", "right"]].set_visible(False)

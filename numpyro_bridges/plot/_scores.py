@@ -5,13 +5,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .._checks import as_float, flag, known_float, known_number, require, require_instance
 from .._linalg import apply
 from ..bridges import GuidedBridge
-from ._canvas import as_points, draw, pyplot, seen
+from ._canvas import as_file, as_points, draw, pyplot, seen
 from ._shapes import score_field
 
 _PALE = "#c8c8c8"
@@ -45,6 +45,12 @@ def score_frames(
     and times that do not fit; `ImportError` without matplotlib.
     """
     bridges = bridges if isinstance(bridges, Mapping) else {"": bridges}
+    require(len(bridges) > 0, "`bridges` must hold at least one `GuidedBridge`; got none.")
+    for name, bridge in bridges.items():
+        require_instance(bridge, GuidedBridge, f"bridges[{name!r}]" if name else "bridges", "a `GuidedBridge`")
+    file, closed = as_file(file, "file"), flag(closed, "closed")
+    if scale is not None:
+        scale = known_number(scale, "scale", "a number from 0 on, a time", lambda value: value >= 0)
     paths = paths if isinstance(paths, Mapping) else dict.fromkeys(bridges, paths)
     if set(paths) != set(bridges):
         raise ValueError(f"`paths` must have the names of `bridges`, {list(bridges)}; got {list(paths)}.")
@@ -75,11 +81,11 @@ class _Row:
         space = bridge.sde.space
         to_points = (lambda x: x) if space is None else space.to_points
         self.times = np.asarray(bridge.ts)[chosen]
-        self.points = as_points(jax.vmap(to_points)(states[chosen]), "points of paths", "(T, q, 2)")
         drifts = _guiding_drift(bridge, bridge.ts[chosen], states[chosen])
         self.drifts = np.asarray(jax.vmap(to_points)(drifts), dtype=float)
         if not np.isfinite(self.drifts).all():
             raise ValueError("`paths` must lead to finite drifts a(t, x) ∇ log h̃(t, x); got NaN or infinite ones.")
+        self.points = as_points(jax.vmap(to_points)(states[chosen]), "paths", "(T, q, 2)")
         self.target = np.asarray(to_points(bridge.condition.reference(bridge.sde, states[-1])), dtype=float)
 
     def corners(self, scale: float) -> NDArray:
@@ -102,7 +108,7 @@ def _default_scale(rows: list[_Row]) -> float:
 
 
 def _states(bridge: GuidedBridge, path: ArrayLike) -> jax.Array:
-    states = jnp.asarray(path, bridge.x0.dtype)
+    states = as_float(path, "paths").astype(bridge.x0.dtype)
     shape = (bridge.num_steps + 1, *bridge.x0.shape)
     if states.shape != shape:
         raise ValueError(f"`paths` must have a state for each of a bridge's `ts`, shape {shape}; got {states.shape}.")
@@ -111,8 +117,9 @@ def _states(bridge: GuidedBridge, path: ArrayLike) -> jax.Array:
 
 def _chosen(bridge: GuidedBridge, times: ArrayLike) -> NDArray:
     """The grid times nearest to the given ones, the end left out, as numbers."""
-    ts, times = np.asarray(bridge.ts), np.atleast_1d(np.asarray(times, dtype=float))
-    if not times.size or times.min() < ts[0] or times.max() >= ts[-1]:
+    ts, times = np.asarray(bridge.ts), np.atleast_1d(known_float(times, "times"))
+    inside = np.all((times >= ts[0]) & (times < ts[-1]))
+    if times.ndim > 1 or not times.size or not inside:
         raise ValueError(f"`times` must lie in [{ts[0]}, {ts[-1]}), before the end; got {times}.")
     return np.abs(ts[:-1] - times[:, None]).argmin(axis=1)
 

@@ -5,6 +5,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._checks import choice, flag, known_number, positive_integer
 from ._canvas import NEUTRAL, START, TARGET, as_points, as_times, draw, seen, shape_axes, time_map
 
 
@@ -24,6 +25,8 @@ def outlines(
     """
     shapes = as_points(shapes, "shapes", "(n, 2)", "(N, n, 2)")
     shapes = shapes.reshape(-1, *shapes.shape[-2:])
+    closed = flag(closed, "closed")
+    linewidth = known_number(linewidth, "linewidth", "a positive number", lambda value: value > 0)
     ax = shape_axes(ax, shapes)
     style: dict[str, Any] = {"alpha": _opacity(len(shapes))} | kwargs
     lines = draw(ax, shapes, closed, colors=color, linewidths=linewidth, **style)
@@ -59,6 +62,8 @@ def path(
     """
     path = as_points(path, "path", "(K + 1, n, 2)")
     times = as_times(ts, len(path))
+    closed, trajectories = flag(closed, "closed"), flag(trajectories, "trajectories")
+    num_outlines = positive_integer(num_outlines, "num_outlines")
     ax = shape_axes(ax, path)
     if trajectories:
         draw(ax, path.transpose(1, 0, 2), False, colors=NEUTRAL, linewidths=0.5, alpha=0.5, zorder=1)
@@ -100,6 +105,9 @@ def bridge_fan(
 
     **Returns:** one `LineCollection` of outlines for each frame.
     """
+    max_outlines = positive_integer(max_outlines, "max_outlines")
+    num_frames, closed = positive_integer(num_frames, "num_frames"), flag(closed, "closed")
+    choice(direction, "direction", ("row", "column"))
     paths = as_points(paths, "paths", "(S, K + 1, n, 2)")[:max_outlines]
     start, target = as_points(start, "start", "(n, 2)"), as_points(target, "target", "(n, 2)")
     times = as_times(ts, paths.shape[1])
@@ -153,7 +161,10 @@ def score_field(
     points, arrows = as_points(points, "points", "(n, 2)"), as_points(arrows, "arrows", "(n, 2)")
     if arrows.shape != points.shape:
         raise ValueError(f"`arrows` must have the shape of `points` {points.shape}, got {arrows.shape}.")
-    length = 0.25 * float(np.ptp(points, axis=0).max()) if length is None else length
+    closed = flag(closed, "closed")
+    if length is None:
+        length = 0.25 * float(np.ptp(seen(points), axis=0).max())
+    length = known_number(length, "length", "a number from 0 on", lambda value: value >= 0)
     longest = np.linalg.norm(arrows, axis=1).max()
     drawn = arrows * (length / longest if longest > 0.0 else 0.0)
     ax = shape_axes(ax, np.concatenate([points, points + drawn]))

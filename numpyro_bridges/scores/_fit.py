@@ -19,7 +19,7 @@ import jax.random as jr
 from jaxtyping import Array, PRNGKeyArray
 
 from .. import weights
-from .._checks import concrete, require, require_instance
+from .._checks import as_path, choice, concrete, flag, require, require_instance, require_key, words
 from .._linalg import full_precision
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
@@ -92,15 +92,23 @@ def fit(
     **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
     training with a warning.
     """
-    require(
-        method in METHODS, f"`method` must be one of {sorted(METHODS)}; got {method!r}. 'residual' suits every bridge."
-    )
+    choice(method, "method", sorted(METHODS), "'residual' suits every bridge.")
+    require_key(key)
     if ts is None and num_steps is None:
         num_steps = 100
     bridge = GuidedBridge(sde, condition, x0=x0, t1=t1, t0=t0, num_steps=num_steps, ts=ts, guide=guide)
     training = Training() if training is None else training
     require_instance(training, Training, "training", "a `Training(...)`")
-    require(context is None or callable(context), f"`context` must be a function of the SDE; got {context!r}.")
+    for name, function, meant in (
+        ("context", context, "of the SDE"),
+        ("network", network, "(t, x, v, theta)"),
+        ("draw", draw, "of a key that gives (sde, condition, x0)"),
+        ("watch", watch, "(name, guide)"),
+    ):
+        good = function is None or callable(function)
+        require(good, f"`{name}` must be a function {meant}; got {words(function)}.")
+    progress = flag(progress, "progress")
+    folder = None if directory is None else as_path(directory, "directory")
     key_network, key_pilot, key_train = jr.split(key, 3)
 
     def draw_bridge(key):
@@ -124,7 +132,7 @@ def fit(
         partial(
             _train,
             given=bridge,
-            directory=None if directory is None else Path(directory),
+            directory=folder,
             progress=progress,
             watch=watch,
         ),

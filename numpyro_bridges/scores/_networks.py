@@ -1,5 +1,6 @@
 """Networks `network(t, x, v, theta)`: `ScoreGuide` says what they are given. Ours start at zero, `UNet` does not."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,8 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
+
+from .._checks import known_number, positive_integer, require, require_instance, require_key, words
 
 State2 = Float[Array, "n dim"]
 
@@ -29,8 +32,10 @@ class MLP(eqx.Module):
     num_times: int = eqx.field(static=True)
 
     def __init__(self, shape: tuple[int, int], context: int = 0, *, key: PRNGKeyArray, width: int = 64, depth: int = 3):
-        self.num_times = 4
-        size = int(np.prod(shape))
+        require_key(key)
+        self.num_times, size = 4, _size(shape)
+        context = positive_integer(context, "context", least=0)
+        width, depth = positive_integer(width, "width"), positive_integer(depth, "depth", least=0)
         layers = eqx.nn.MLP(2 * size + context + 8 + 2, size, width, depth, jax.nn.silu, key=key)
         self.layers = eqx.tree_at(lambda m: m.layers[-1], layers, replace_fn=_zero)
 
@@ -62,6 +67,10 @@ class PointNetwork(eqx.Module):
     def __init__(
         self, dim: int, context: int = 0, *, key: PRNGKeyArray, width: int = 16, depth: int = 2, heads: int = 2
     ):
+        require_key(key)
+        dim, context = positive_integer(dim, "dim"), positive_integer(context, "context", least=0)
+        width, heads = positive_integer(width, "width"), positive_integer(heads, "heads")
+        depth = positive_integer(depth, "depth", least=0)
         key_in, key_out, *keys = jr.split(key, 2 + 2 * depth)
         self.inner = eqx.nn.Linear(2 * dim + context + 10, width, key=key_in)
         self.values = [eqx.nn.Linear(width, width, key=k) for k in keys[:depth]]
@@ -98,6 +107,9 @@ class Singular(eqx.Module):
     softness: float = eqx.field(static=True)
 
     def __init__(self, network: Any, *, key: PRNGKeyArray, softness: float = 0.0):
+        require_key(key)
+        require(callable(network), f"`network` must be a function (t, x, v, theta); got {words(network)}.")
+        softness = known_number(softness, "softness", "a number from 0 on", lambda value: value >= 0)
         gain = eqx.nn.MLP(10, "scalar", 16, 1, jax.nn.silu, key=key)
         self.gain = eqx.tree_at(lambda m: m.layers[-1], gain, replace_fn=_zero)
         self.network, self.softness = network, softness
@@ -128,8 +140,8 @@ class UNet(eqx.Module):
     embedding: int = eqx.field(static=True)
 
     def __init__(self, shape: tuple[int, int], widths: Sequence[int], embedding: int, *, key: PRNGKeyArray):
+        size, widths, embedding = _checked(shape, widths, embedding, key)
         key_in, key_middle, key_out, *keys = jr.split(key, 3 + 2 * len(widths))
-        size, widths = int(np.prod(shape)), list(widths)
         self.embedding = embedding
         self.inner = _xavier(size, embedding, key_in)
         ins = [embedding, *widths[:-1]]
@@ -144,6 +156,8 @@ class UNet(eqx.Module):
     def build(cls, shape, widths, embedding, *, key: PRNGKeyArray) -> "WithState":
         """The network with its running means."""
 
+        _checked(shape, widths, embedding, key)
+
         @eqx.filter_jit  # one program, in place of a small one for each array
         def made(key):
             return WithState(*eqx.nn.make_with_state(cls)(shape, widths, embedding, key=key))
@@ -153,7 +167,7 @@ class UNet(eqx.Module):
     @classmethod
     def published(cls, shape, num_bases: int, *, key: PRNGKeyArray) -> "WithState":
         """The network for N basis functions or landmarks, in the plane."""
-        N = num_bases
+        N = positive_integer(num_bases, "num_bases")
         return cls.build(shape, (8 * N, 4 * N, 2 * N, N), 4 * N, key=key)
 
     def __call__(self, t, x, v, theta, state):
@@ -201,6 +215,10 @@ class WithState(eqx.Module):
     network: Any
     state: eqx.nn.State
 
+    def __check_init__(self):
+        require(callable(self.network), f"`network` must be a function; got {words(self.network)}.")
+        require_instance(self.state, eqx.nn.State, "state", "what `eqx.nn.make_with_state` gives")
+
     def __call__(self, t, x, v, theta):
         return eqx.nn.inference_mode(self.network)(t, x, v, theta, self.state)[0]
 
@@ -216,6 +234,27 @@ def over_batch(network, t, x, v, theta):
         outputs, state = mapped(t, x, v, theta, network.state)
         return outputs, WithState(network.network, state)
     return jax.vmap(network, ROWWISE)(t, x, v, theta), network
+
+
+def _size(shape: tuple[int, int]) -> int:
+    """Of a state, in numbers."""
+    require(
+        isinstance(shape, Sequence) and not isinstance(shape, str) and 1 <= len(shape) <= 2,
+        f"`shape` must be that of a state, (n, dim); got {words(shape)}.",
+    )
+    return math.prod(positive_integer(number, "shape") for number in shape)
+
+
+def _checked(shape, widths, embedding, key) -> tuple[int, list[int], int]:
+    """What a `UNet` is built from."""
+    require_key(key)
+    require(
+        isinstance(widths, Sequence) and not isinstance(widths, str) and len(widths) > 0,
+        f"`widths` must be those of one level or more, such as (64, 32); got {words(widths)}.",
+    )
+    embedding = positive_integer(embedding, "embedding", least=2)
+    require(embedding % 2 == 0, f"`embedding` must be even, a cosine for each sine; got {embedding}.")
+    return _size(shape), [positive_integer(width, "widths") for width in widths], embedding
 
 
 def _xavier(size_in: int, size: int, key: PRNGKeyArray) -> eqx.nn.Linear:

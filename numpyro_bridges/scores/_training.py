@@ -17,7 +17,7 @@ import optax
 from jaxtyping import Array, PRNGKeyArray
 from tqdm.auto import tqdm
 
-from .._checks import positive_integer, require
+from .._checks import flag, known_number, positive_integer, require, words
 from .._files import write_whole
 
 
@@ -64,16 +64,19 @@ class Training(eqx.Module):
         self.batch_size = positive_integer(batch_size, "batch_size")
         self.interval = min(positive_integer(interval, "interval"), self.num_updates)
         self.held_out = positive_integer(held_out, "held_out")
-        require(0 <= average < 1, f"`average` must be in [0, 1); got {average}.")
-        require(learning_rate > 0, f"`learning_rate` must be positive; got {learning_rate}.")
+        average = known_number(average, "average", "in [0, 1)", lambda value: 0 <= value < 1)
+        learning_rate = _rate(learning_rate)
         if optimizer is None:
             warm = min(50, self.num_updates // 4)
             schedule = optax.warmup_cosine_decay_schedule(
                 0.0, learning_rate, warm, self.num_updates, 0.01 * learning_rate
             )
             optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+        good = isinstance(optimizer, optax.GradientTransformation)
+        require(good, f"`optimizer` must be one of optax, such as `optax.adam(1e-3)`; got {words(optimizer)}.")
         self.optimizer, self.average = optimizer, average
-        self.patience, self.one_step = patience, bool(one_step)
+        self.patience = None if patience is None else positive_integer(patience, "patience")
+        self.one_step = flag(one_step, "one_step")
 
     @classmethod
     def published(cls, num_epochs: int = 100, learning_rate: float = 1e-4) -> "Training":
@@ -82,11 +85,16 @@ class Training(eqx.Module):
         The rate falls to a hundredth of `learning_rate`, which is 1e-4 as published.
         """
         total = 40 * positive_integer(num_epochs, "num_epochs")
+        learning_rate = _rate(learning_rate)
         schedule = optax.warmup_cosine_decay_schedule(
             0.0, learning_rate, min(500, total // 2), total, 0.01 * learning_rate
         )
         settings = {"average": 0.0, "interval": 40, "patience": None, "one_step": True}
         return cls(total, 50, learning_rate=learning_rate, optimizer=optax.adam(schedule), **settings)
+
+
+def _rate(value: Any) -> float:
+    return known_number(value, "learning_rate", "positive", lambda rate: rate > 0)
 
 
 class _State(eqx.Module):

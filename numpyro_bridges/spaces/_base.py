@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import floating, require
+from .._checks import floating, require, require_finite, require_instance
 
 
 class AbstractSpace(eqx.Module):
@@ -45,7 +45,7 @@ class AbstractSpace(eqx.Module):
 
     def inner(self, x: Float[Array, "n dim"], y: Float[Array, "n dim"]) -> Float[Array, ""]:
         """⟨x, y⟩ = Σ_i w_i x_i · y_i."""
-        x, y = self._state(x), self._state(y)
+        x, y = self._state(x), self._state(y, "y")
         require(
             jnp.ndim(self.weights) == 1,
             f"`weights` must be of shape ({self.size},); got {jnp.shape(self.weights)}. For a batch of "
@@ -84,33 +84,45 @@ class AbstractSpace(eqx.Module):
             f"{values.shape}. Fewer points become a curve by `refine` from `Landmarks` of their number; "
             "for a batch, use `jax.vmap`.",
         )
-        s = equispaced(values.shape[0]) if s is None else s
+        require_finite(values, "values", "Missing points are left out, with `s` for those that are there.")
+        basis = self.basis(equispaced(values.shape[0]) if s is None else s)
         require(
-            jnp.shape(s) == values.shape[:1],
-            f"`s` must have one parameter for each of {values.shape[0]} points; got shape {jnp.shape(s)}.",
+            basis.shape[0] == values.shape[0],
+            f"`s` must have one parameter for each of {values.shape[0]} points; got shape {basis.shape[:1]}.",
         )
-        return jnp.linalg.lstsq(self.basis(s).astype(values.dtype), values)[0]
+        return jnp.linalg.lstsq(basis.astype(values.dtype), values)[0]
 
     def refine(self, x: Float[Array, "n dim"], finer: "AbstractSpace") -> Float[Array, "m dim"]:
         """The same curve as a state of another space that is at least as fine, of either kind.
 
         A coarser space gets what its `from_points` makes of the curve: its points, or projected coefficients.
         """
+        require_instance(finer, AbstractSpace, "finer", "a space, such as `FourierBasis(num_modes, dim)`")
         require(
             finer.dim == self.dim,
             f"`finer` must hold curves in R^{self.dim}; got a space of dimension {finer.dim}.",
         )
         return finer.from_points(self.evaluate(x, finer.grid))
 
-    def _state(self, x: ArrayLike) -> Float[Array, "n dim"]:
+    def _state(self, x: ArrayLike, name: str = "x") -> Float[Array, "n dim"]:
         """A state, or `ValueError`: one row too few would broadcast."""
-        x = floating(x, "x")
+        x = floating(x, name)
         require(
             x.shape == (self.size, self.dim),
-            f"a state of this space must have shape ({self.size}, {self.dim}); got {x.shape}. For a batch, "
-            "use `jax.vmap`.",
+            f"`{name}`, a state of this space, must have shape ({self.size}, {self.dim}); got {x.shape}. "
+            "For a batch, use `jax.vmap`.",
         )
         return x
+
+    def _field(self, values: ArrayLike) -> Float[Array, "q ..."]:
+        """The values of a field at the points of `grid`."""
+        values = floating(values, "values")
+        num_points = len(self.grid)
+        require(
+            values.shape[:1] == (num_points,),
+            f"`values` must have a row for each of {num_points} points; got shape {values.shape}.",
+        )
+        return values
 
 
 def equispaced(n: int) -> np.ndarray:

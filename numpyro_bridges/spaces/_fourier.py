@@ -6,10 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import concrete, positive_integer, require
-from ._base import AbstractSpace, equispaced, floating
+from .._checks import floating, positive_integer, require, require_finite
+from ._base import AbstractSpace, equispaced
 
 
 def fourier_functions(s: ArrayLike, num_modes: int) -> Any:
@@ -17,9 +18,11 @@ def fourier_functions(s: ArrayLike, num_modes: int) -> Any:
 
     In NumPy and double precision unless s is traced: single precision loses digits in cos ns for a large n.
     """
-    known = concrete(s)
-    xp, s = (jnp, floating(s, "s")) if known is None else (np, known.astype(float))
+    converted = floating(s, "s")
+    traced = isinstance(converted, Tracer)
+    xp, s = (jnp, converted) if traced else (np, np.asarray(s, float))
     require(s.ndim == 1, f"`s` must be a vector of parameters; got shape {s.shape}.")
+    require_finite(converted, "s")
     angles = s[:, None] * xp.arange(1, num_modes + 1, dtype=s.dtype)[None]
     waves = xp.stack([xp.cos(angles), xp.sin(angles)], axis=-1).reshape(s.size, 2 * num_modes)
     return xp.concatenate([xp.ones_like(s)[:, None], sqrt(2) * waves], axis=1)
@@ -79,10 +82,6 @@ class FourierBasis(AbstractSpace):
 
     def from_points(self, values: Float[Array, "q ..."]) -> Float[Array, "n ..."]:
         """Φᵀ W f: exact for a field whose bandwidth and `num_modes` add up to less than `num_quadrature`."""
-        values = floating(values, "values")
-        require(
-            values.shape[:1] == (self.num_quadrature,),
-            f"`values` must have a row for each of {self.num_quadrature} points; got shape {values.shape}.",
-        )
+        values = self._field(values)
         projection = fourier_functions(self.grid, self.num_modes).T / self.num_quadrature
         return jnp.tensordot(jnp.asarray(projection, values.dtype), values, axes=1, precision="highest")

@@ -60,8 +60,8 @@ class Landmarks(AbstractSpace):
 
     def to_points(self, x: Float[Array, "n dim"]) -> Float[Array, "n dim"]:
         """The state itself."""
-        return x
+        return self._state(x)
 
     def from_points(self, values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         """The values themselves."""
-        return values
+        return self._field(values)
