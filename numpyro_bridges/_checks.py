@@ -203,10 +203,12 @@ def known_number(
     rule: str = "a finite number",
     ok: Callable[[float], bool] = math.isfinite,
 ) -> float:
-    """A finite setting that is known before tracing and meets a rule, which is given in words too."""
+    """A finite setting that is known before tracing and, in the precision in use, meets a rule, in words too."""
     number = known_float(value, name)
+    with np.errstate(over="ignore", under="ignore"):
+        rounded = number.astype(jnp.result_type(float))
     require(
-        number.ndim == 0 and np.isfinite(number) and ok(float(number)),
+        number.ndim == 0 and np.isfinite(rounded) and ok(float(rounded)),
         f"`{name}` must be {rule}; got {words(value)}.",
     )
     return float(number)

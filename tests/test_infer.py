@@ -215,7 +215,7 @@ REFUSED = {
     "model": (lambda: FunctionSpaceHMC(3), "`model` must be a NumPyro model"),
     "discrete": (lambda: FunctionSpaceHMC(discrete), r"cannot draw the discrete sites \['which'\]"),
     "no noise": (lambda: FunctionSpaceHMC(no_noise), "found no driving noise among the latent sites"),
-    "step": (lambda: FunctionSpaceHMC(conjugate, step_size=0.0), "`step_size` must be positive; got 0.0"),
+    "step": (lambda: FunctionSpaceHMC(conjugate, step_size=0.0), "`step_size` must be positive and finite; got 0.0"),
     "target": (lambda: FunctionSpaceHMC(conjugate, target_accept_prob=1.0), r"must be in \(0, 1\); got 1.0"),
     "length": (lambda: FunctionSpaceHMC(conjugate, trajectory_length=-1.0), "`trajectory_length` must be positive"),
     "jitter": (lambda: FunctionSpaceHMC(conjugate, jitter=1.0), r"`jitter` must be in \[0, 1\); got 1.0"),

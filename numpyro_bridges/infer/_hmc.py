@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import jax.random as jr
 from jax import Array
 
-from .._checks import require
-from ._kernel import AbstractBridgeKernel
+from .._checks import flag, known_number, positive_integer
+from ._kernel import POSITIVE, PROPORTION, PROPORTION_OR_0, AbstractBridgeKernel
 from ._posterior import Sites, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
 from ._rotation import choose, half_square, kick, metropolis, normal_like, rotate, total
@@ -67,11 +67,12 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
 
     - `model`: a NumPyro model with sites of driving noise. Its other latent sites are continuous parameters, with a
       dense mass matrix that is adapted in the warm-up, and started at a Laplace approximation.
-    - `step_size`: ε, an angle, adapted in the warm-up unless `adapt_step_size=False`.
+    - `step_size`: ε, an angle, adapted in the warm-up unless `adapt_step_size=False`. It is never below
+      `trajectory_length / max_num_steps`: a smaller one is raised to that.
     - `target_accept_prob`: of that adaptation.
     - `trajectory_length`: the angle by which the Gaussian part turns (π/2 forgets it), jittered by ± `jitter` of
       itself. A draw takes `trajectory_length / step_size` gradients, rounded up.
-    - `max_num_steps`: bounds that number, and so keeps ε from below.
+    - `max_num_steps`: bounds that number, adapted or not. The trajectory keeps its length.
     - `init_strategy`: the noise starts at zero, the guided mean path; parameters at their prior medians, from where the
       Laplace approximation is sought. Chains start at draws from it, or at `init_params`.
     """
@@ -89,13 +90,12 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         init_strategy=init_to_guided_mean,
     ):
         super().__init__(model, init_strategy)
-        require(step_size > 0, f"`step_size` must be positive; got {step_size}.")
-        require(0 < target_accept_prob < 1, f"`target_accept_prob` must be in (0, 1); got {target_accept_prob}.")
-        require(trajectory_length > 0, f"`trajectory_length` must be positive; got {trajectory_length}.")
-        require(0 <= jitter < 1, f"`jitter` must be in [0, 1); got {jitter}.")
-        self._step_size, self._adapt_step_size = step_size, adapt_step_size
-        self._target, self._length, self._jitter = target_accept_prob, trajectory_length, jitter
-        self._max_num_steps = max_num_steps
+        self._step_size = known_number(step_size, "step_size", *POSITIVE)
+        self._target = known_number(target_accept_prob, "target_accept_prob", *PROPORTION)
+        self._adapt_step_size = flag(adapt_step_size, "adapt_step_size")
+        self._length = known_number(trajectory_length, "trajectory_length", *POSITIVE)
+        self._jitter = known_number(jitter, "jitter", *PROPORTION_OR_0)
+        self._max_num_steps = positive_integer(max_num_steps, "max_num_steps")
 
     def get_diagnostics_str(self, state):
         step, steps = float(state.adapt_state.step_size), int(state.num_steps)
@@ -103,7 +103,8 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
 
     def _init_one(self, key, z, reference, model_args, model_kwargs):
         phi, gradient = jax.value_and_grad(self._misfit)(z, model_args, model_kwargs)
-        step = jnp.asarray(self._step_size, phi.dtype)
+        least, _ = self._step_bounds
+        step = jnp.maximum(jnp.asarray(self._step_size, phi.dtype), least)
         adapt = AdaptState(*start_step_size(step), start_windows(reference))
         energy = phi + half_square(self._parts(z)[1])
         i, zero, no = jnp.zeros((), int), jnp.zeros_like(phi), jnp.array(False)
@@ -128,7 +129,9 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         def psi(x):
             return self._misfit(to_sites(x), model_args, model_kwargs) - half_square(x[0])
 
-        steps = jnp.ceil(self._length / state.adapt_state.step_size).astype(int)
+        # Rounding may lift the quotient above its bound, and the step may come from another kernel.
+        steps = jnp.ceil(self._length / state.adapt_state.step_size)
+        steps = jnp.clip(steps, 1, self._max_num_steps).astype(int)
         turn = jr.uniform(key_length, (), y.dtype, 1 - self._jitter, 1 + self._jitter) * self._length
         half = 0.5 * turn / steps
 
@@ -165,14 +168,21 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
             key,
         )
 
+    @property
+    def _step_bounds(self) -> tuple[float, float]:
+        """Of the step as it adapts; the lower one holds for every step.
+
+        Two steps at least, where they are allowed: with one, parameters stick where their posterior
+        is far from the reference.
+        """
+        return self._length / self._max_num_steps, self._length / min(2, self._max_num_steps)
+
     def _adapted(self, state, rate, theta) -> AdaptState:
         adapt = state.adapt_state
         windows, renewed = update_windows(adapt.windows, state.i, self._num_warmup, theta)
         step = StepSize(adapt.step_size, adapt.averaging)
         if self._adapt_step_size:
-            # Two steps at least: with one, parameters stick where their posterior is far from the reference.
-            bounds = self._length / self._max_num_steps, self._length / 2
             last = state.i == self._num_warmup - 1
-            step = update_step_size(step, self._target - rate, bounds, renew=renewed, last=last)
+            step = update_step_size(step, self._target - rate, self._step_bounds, renew=renewed, last=last)
         new = AdaptState(*step, windows)
         return choose(self._warming(state), new, adapt)

@@ -19,9 +19,14 @@ from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import constrain_fn
 from numpyro.util import is_prng_key
 
-from .._checks import concrete, require
+from .._checks import concrete, require, words
 from ._posterior import Sites, init_to_guided_mean, is_latent, is_noise, misfit, sites_of
 from ._reference import Reference, laplace
+
+# Rules of settings, in words and as a test.
+POSITIVE = "positive and finite", lambda x: x > 0
+PROPORTION = "in (0, 1)", lambda x: 0 < x < 1
+PROPORTION_OR_0 = "in [0, 1)", lambda x: 0 <= x < 1
 
 
 class AbstractBridgeKernel(MCMCKernel):
@@ -29,6 +34,10 @@ class AbstractBridgeKernel(MCMCKernel):
 
     def __init__(self, model, init_strategy=init_to_guided_mean):
         require(callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}.")
+        require(
+            callable(init_strategy),
+            f"`init_strategy` must be a strategy such as `init_to_median`; got {words(init_strategy)}.",
+        )
         self._model = model
         self._init_strategy = init_strategy
         self._sample_fn = None

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import jax.random as jr
 from jax import Array
 
-from .._checks import positive_integer, require
-from ._kernel import AbstractBridgeKernel
+from .._checks import flag, known_number, positive_integer, require
+from ._kernel import PROPORTION, AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
 
@@ -63,11 +63,12 @@ class AbstractPCN(AbstractBridgeKernel):
         init_strategy=init_to_guided_mean,
     ):
         super().__init__(model, init_strategy)
-        require(0 < angle <= pi / 2, f"`angle` must be in (0, π/2]; got {angle}.")
-        require(0 < target_accept_prob < 1, f"`target_accept_prob` must be in (0, 1); got {target_accept_prob}.")
+        # In single precision π/2 is above π/2.
+        self._angle = known_number(angle, "angle", "in (0, π/2]", lambda x: 0 < x < pi / 2 + 1e-6)
+        self._target = known_number(target_accept_prob, "target_accept_prob", *PROPORTION)
+        self._adapt_angle = flag(adapt_angle, "adapt_angle")
         self._num_moves = positive_integer(num_moves, "num_moves")
         self._num_blocks = positive_integer(num_blocks, "num_blocks")
-        self._angle, self._adapt_angle, self._target = angle, adapt_angle, target_accept_prob
 
     @abstractmethod
     def _evaluate(self, z: Sites, model_args, model_kwargs) -> tuple[tuple[Array, ...], Sites]:

@@ -23,8 +23,8 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import logsumexp
 
-from .._checks import concrete, positive_integer, require
-from ._kernel import AbstractBridgeKernel
+from .._checks import concrete, known_number, positive_integer, require
+from ._kernel import POSITIVE, PROPORTION_OR_0, AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
 from ._rotation import choose, kick, metropolis, normal_like, rotate, total
@@ -67,12 +67,12 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         init_strategy=init_to_guided_mean,
     ):
         super().__init__(model, init_strategy)
-        require(0 <= correlation < 1, f"`correlation` must be in [0, 1); got {correlation}.")
-        require(step_size is None or step_size > 0, f"`step_size` must be positive; got {step_size}.")
+        self._turn = math.acos(known_number(correlation, "correlation", *PROPORTION_OR_0))
+        self._step_size = step_size
+        if step_size is not None:
+            self._step_size = known_number(step_size, "step_size", *POSITIVE)
         self._num_particles = None if num_particles is None else positive_integer(num_particles, "num_particles")
         self._max_particles = positive_integer(max_particles, "max_particles")
-        self._turn = math.acos(correlation)
-        self._step_size = step_size
 
     @abstractmethod
     def _evaluate(self, potential, theta: Array) -> tuple:
@@ -132,9 +132,10 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         potential = self._potential(particles, unravel, model_args, model_kwargs)
         (value, energies), force = self._evaluate(potential, theta)
         z = unravel(theta) | self._pick(key_pick, particles, energies)
-        step = jnp.asarray(self._step_size or self._best_step(theta.size), value.dtype)
+        step = self._best_step(theta.size) if self._step_size is None else self._step_size
         zero, no = jnp.zeros_like(value), jnp.array(False)
         windows, i = start_windows(reference), jnp.array(0)
+        step = jnp.asarray(step, value.dtype)
         return PseudoMarginalState(i, z, particles, value, force, step, windows, zero, zero, no, key)
 
     def refresh(self, state, model_args, model_kwargs):
