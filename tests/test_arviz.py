@@ -3,12 +3,14 @@
 import warnings
 
 import jax
+import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
 import xarray
+from numpyro import handlers
 from numpyro.infer import HMC, MCMC, NUTS, Gibbs, log_likelihood
 from numpyro.util import nested_attrgetter
 
@@ -52,15 +54,15 @@ def two_sites(data):
 WINGS = np.linspace(-1, 1, 6).reshape(3, 2, 1)
 
 
-def made_up_run(kernel, samples=None, **fields):
-    """A run of `two_sites` with draws that nothing had to compile, 2 chains of 7."""
+def made_up_run(kernel, samples=None, args=(WINGS,), **fields):
+    """A run, of `two_sites` or another model, with draws that nothing had to compile, 2 chains of 7."""
     rng = np.random.default_rng(1)
     if samples is None:
         shapes = {"mean": (), "end": (), "wing_noise": (3, STEPS, 2, 1), "leg_noise": (STEPS + 1, 2, 1)}
         samples = {name: rng.normal(size=(2, 7, *shape)) for name, shape in shapes.items()}
         samples["end"] = np.exp(0.1 * samples["end"])
     mcmc = MCMC(kernel, num_warmup=0, num_samples=7, num_chains=2, chain_method="sequential", progress_bar=False)
-    mcmc._states, mcmc._args, mcmc._kwargs = {"z": samples, **fields}, (WINGS,), {}
+    mcmc._states, mcmc._args, mcmc._kwargs = {"z": samples, **fields}, args, {}
     return mcmc
 
 
@@ -244,4 +246,149 @@ def test_fields_are_in_the_states(kernel):
 def test_samplers_without_a_model():
     mcmc = MCMC(NUTS(potential_fn=lambda z: 0.5 * z**2), num_warmup=2, num_samples=2, progress_bar=False)
     with pytest.raises(ValueError, match="must run a NumPyro model"):
+        nb.to_arviz(mcmc)
+
+
+# Masks
+
+
+KEEP = np.array([[True, True], [True, False], [True, True]])
+PAIRS = np.where(KEEP[..., None], np.random.default_rng(2).normal(0.3, 0.6, (3, 2, 2)), np.nan)
+SIZES = np.arange(6).reshape(3, 2)
+
+
+def masked_model():
+    """Everything that may carry a mask: a bridge, an ordinary site, one of whole vectors, `obs_mask`."""
+    mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
+    sde = nb.LinearSDE(-1.0, 0.6, mean)
+    law = nb.DiffusionEndpoint(sde, np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=STEPS)
+    with numpyro.plate("sides", 2, dim=-1), numpyro.plate("specimens", 3, dim=-2):
+        with handlers.mask(mask=KEEP):
+            nb.sample("wing", law, obs=PAIRS)
+            numpyro.sample("spots", dist.Poisson(jnp.exp(mean)), obs=SIZES)
+        with handlers.scale(scale=3.0), handlers.mask(mask=mean > -100):
+            numpyro.sample("size", dist.Normal(mean, 1.0), obs=SIZES)
+        numpyro.sample("tail", dist.Normal(mean, 1.0), obs=1.0 * SIZES, obs_mask=KEEP)
+        with handlers.mask(mask=mean < 0):
+            numpyro.sample("sometimes", dist.Normal(mean, 1.0), obs=SIZES)
+        with handlers.mask(mask=False):
+            numpyro.sample("never", dist.Normal(mean, 1.0), obs=SIZES)
+    with numpyro.plate("row", 3):
+        fine = dist.Normal(mean, 1.0).expand([3, 2]).mask(KEEP & [[True, False], [False, False], [True, True]])
+        numpyro.sample("pair", fine.to_event(1), obs=SIZES)
+
+
+@pytest.fixture(scope="module")
+def masked():
+    rng = np.random.default_rng(3)
+    shapes = {"mean": (), "wing_noise": (3, 2, STEPS, 2, 1), "tail_unobserved": (3, 2)}
+    samples = {name: rng.normal(size=(2, 7, *shape)) for name, shape in shapes.items()}
+    return samples, nb.to_arviz(made_up_run(NUTS(masked_model), samples, ()), coords={"sides": ["left", "right"]})
+
+
+def test_masked_data_are_no_data(masked):
+    samples, data = masked
+    mean = samples["mean"][..., None, None]
+    assert set(data.log_likelihood.data_vars) == {"wing", "spots", "size", "tail_observed", "sometimes", "pair"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        counts = {name: arviz.loo(data, var_name=name).n_data_points for name in data.log_likelihood.data_vars}
+    assert counts == {"wing": 5, "spots": 5, "size": 6, "tail_observed": 5, "sometimes": 6, "pair": 2}
+    normal = dist.Normal(mean, 1.0).log_prob(SIZES)
+    expected = {
+        "spots": dist.Poisson(np.exp(mean)).log_prob(SIZES)[..., KEEP],
+        "tail_observed": normal[..., KEEP],
+        "size": normal,
+        "sometimes": np.where(mean < 0, normal, 0.0),
+        "pair": np.stack([normal[..., 0, 0], normal[..., 2, :].sum(-1)], -1),
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(data.log_likelihood[name], values, rtol=1e-6)
+
+    def wing(mean, noise, observed):
+        sde = nb.LinearSDE(-1.0, 0.6, mean)
+        law = nb.DiffusionEndpoint(sde, np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=STEPS)
+        return law.given(noise).log_prob(observed)
+
+    for place, (i, j) in {0: (0, 0), 2: (1, 0), 4: (2, 1)}.items():
+        value = wing(samples["mean"][1, 3], samples["wing_noise"][1, 3, i, j], PAIRS[i, j])
+        assert float(data.log_likelihood["wing"][1, 3, place]) == pytest.approx(float(value), abs=1e-10)
+        assert data.log_likelihood["wing_specimens"][place] == i
+        assert data.log_likelihood["wing_sides"][place] == ["left", "right"][j]
+
+
+def test_masked_data_are_not_observed(masked):
+    found = masked[1].observed_data
+    np.testing.assert_array_equal(found["wing"], PAIRS)
+    for name in ("spots", "tail_observed"):
+        np.testing.assert_array_equal(found[name], np.where(KEEP, SIZES, np.nan))
+    for name in ("size", "sometimes"):
+        np.testing.assert_array_equal(found[name], SIZES)
+    assert np.all(np.isnan(found["never"]))
+    np.testing.assert_array_equal(found["pair"], np.where([[1, 0], [0, 0], [1, 1]], SIZES, np.nan))
+
+
+# Predictions, and names
+
+
+def plain_run():
+    def plain():
+        mean = numpyro.sample("mean", dist.Normal())
+        with numpyro.plate("specimens", 3):
+            numpyro.sample("size", dist.Normal(mean).expand([3, 2]).to_event(1), obs=SIZES)
+
+    return made_up_run(NUTS(plain), {"mean": np.zeros((2, 7))}, ())
+
+
+@pytest.mark.parametrize(
+    "draws, found", [((14,), (2, 7)), ((2, 7), (2, 7)), ((5,), (1, 5)), ((2, 3), (2, 3)), ((1, 7), (1, 7))]
+)
+def test_predictions_of_some_draws(draws, found):
+    made_up = np.arange(np.prod(draws) * 6.0).reshape(*draws, 3, 2)
+    warning = warnings.catch_warnings() if found == (2, 7) else pytest.warns(UserWarning, match="holds draws")
+    with warning:
+        data = nb.to_arviz(plain_run(), posterior_predictive={"size": made_up, "other": made_up})
+    assert data.posterior_predictive["size"].shape == (*found, 3, 2)
+    assert data.posterior_predictive["size"].dims[2] == "specimens"
+    np.testing.assert_array_equal(np.ravel(data.posterior_predictive["size"]), made_up.ravel())
+
+
+def test_predictions_that_are_not_of_the_same_draws():
+    draws = {"size": np.zeros((14, 3, 2)), "mean": np.zeros(5)}
+    with pytest.raises(ValueError, match=r"same draws of every site; got leading axes \[\(5,\), \(14,\)\]"):
+        nb.to_arviz(plain_run(), posterior_predictive=draws)
+
+
+def test_names_with_a_slash(tmp_path, several):
+    """`handlers.scope` makes them, and neither a `DataTree` nor a NetCDF file takes them."""
+    scoped = handlers.scope(two_sites, prefix="moth")
+    samples = made_up_run(NUTS(two_sites)).get_samples(group_by_chain=True)
+    mcmc = made_up_run(NUTS(scoped), {f"moth/{name}": value for name, value in samples.items()})
+    prior = {"moth/mean": np.zeros(4), "moth/wing": np.zeros((4, 3, 2, 1))}
+    data = nb.to_arviz(
+        mcmc,
+        prior=prior,
+        posterior_predictive={"moth/wing": np.zeros((14, 3, 2, 1))},
+        paths=100,
+        coords={"moth/specimens": ["a", "b", "c"], "xy": ["x"]},
+        dims={"moth/wing": ["moth/specimens", "moth/point", "xy"]},
+    )
+    for group in ("observed_data", "posterior_predictive", "prior_predictive"):
+        assert data[group]["moth.wing"].dims[-3:] == ("moth.specimens", "moth.point", "xy")
+    assert set(data.posterior.data_vars) == {"moth.mean", "moth.end"}
+    assert list(data.log_likelihood["moth.specimens"].values) == ["a", "b", "c"]
+    assert data["posterior_paths"]["moth.leg"].dims == ("chain", "draw", "moth.leg_time", "moth.leg_coordinate")
+    np.testing.assert_allclose(data.log_likelihood["moth.wing"], several.log_likelihood["wing"], rtol=1e-12)
+    data.to_netcdf(str(tmp_path / "scoped.nc"), engine="h5netcdf")
+    with xarray.open_dataset(tmp_path / "scoped.nc", group="posterior", engine="h5netcdf") as read:
+        np.testing.assert_array_equal(read["moth.mean"], samples["mean"])
+
+
+def test_names_that_only_a_slash_keeps_apart():
+    def twins(data):
+        mean = numpyro.sample("moth/mean", dist.Normal())
+        numpyro.sample("moth.mean", dist.Normal(mean))
+
+    mcmc = made_up_run(NUTS(twins), {name: np.zeros((2, 7)) for name in ("moth/mean", "moth.mean")})
+    with pytest.raises(ValueError, match=r"\['moth/mean'\] become names of other sites"):
         nb.to_arviz(mcmc)

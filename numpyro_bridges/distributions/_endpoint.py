@@ -80,11 +80,17 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         super().__init__(parts, names, declared, batch_shape, datum.shape, noise_shape, validate_args)
 
     def path(self, observed):
-        """The bridges to `observed` that the bound noise drives, batch axes and then `(num_steps + 1, n, dim)`."""
+        """The bridges to `observed` that the bound noise drives, batch axes and then `(num_steps + 1, n, dim)`.
+
+        NaN where the law is masked: the datum says nothing of that path, and no bridge leads to it.
+        """
         require(self.noise is not None, "`path` needs the noise: use `law.given(noise)`.")
         self._check_value(observed)
         observed = jnp.broadcast_to(observed, self.shape())
-        return self._over_batch(_path, self._full_shape, observed, self.noise)
+        path = self._over_batch(_path, self._full_shape, observed, self.noise)
+        if self._mask is None:
+            return path
+        return jnp.where(self._mask.reshape(self._full_shape + (1,) * (path.ndim - self._mask.ndim)), path, jnp.nan)
 
     @staticmethod
     def _observe(parts, key):

@@ -6,14 +6,18 @@ E[1/p(v_i | z_i, θ)] over the posterior of (z, θ) is E[1/p(v_i | θ)] over tha
 the bridge's weights adds to that of the importance ratios: read Pareto k̂.
 """
 
+import warnings
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro
+from numpyro.distributions import ExpandedDistribution, Independent, MaskedDistribution
 from numpyro.infer import MCMC
 from numpyro.ops.provenance import eval_provenance
 
 from .._checks import positive_integer, require
-from ..distributions import DiffusionEndpoint
+from ..distributions import AbstractNoiseDriven, DiffusionEndpoint
 from ._posterior import is_latent, is_noise, sites_of
 from ._statistics import statistics
 
@@ -34,7 +38,9 @@ def to_arviz(
 
     - `mcmc`: after `run`, with any kernel of a model. Sample statistics are what the run has collected:
       `extra_fields=nb.infer.fields(kernel)` asks for all.
-    - `prior`, `posterior_predictive`: dictionaries from `numpyro.infer.Predictive`.
+    - `prior`, `posterior_predictive`: dictionaries from `numpyro.infer.Predictive`. Those of the posterior may come from
+      flat draws or from draws by chain (`batch_ndims=2`), and from some of the draws: a warning says so, and flat ones
+      then count as one chain, since theirs are not known.
     - `coords`, `dims`: as in ArviZ; plates name their axes.
     - `noise`: keep the driving noise in the posterior.
     - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all whose noise was kept;
@@ -42,23 +48,31 @@ def to_arviz(
 
     **Returns:** an `InferenceData` (ArviZ 0.x) or a `DataTree` (1.x) with the groups of the dictionaries and
 
-    - `posterior`, and `observed_data`.
+    - `posterior`, and `observed_data`. Data masked in every draw (`handlers.mask`, `obs_mask`) are NaN.
     - `log_likelihood`: one value for each datum of each observed site (`numpyro.factor` sites are no data). Left out
-      are sites that need what the run has not kept, such as noise dropped by `extra_fields=("~z.wing_noise",)`.
+      are sites that need what the run has not kept, such as noise dropped by `extra_fields=("~z.wing_noise",)`, and
+      data masked in every draw, which say nothing: where a site has some, its seen data are one axis, `wing_seen`, and
+      coordinates such as `wing_specimens` say which they are. `handlers.scale` does not enter: the value is that of one
+      datum, counted once.
     - `sample_stats`: under ArviZ's names. Those of a block of `Gibbs` have the class of its kernel in front,
       `pcn_acceptance_rate`, numbered where blocks share it, `nuts0_lp`; a draw is `diverging` if any block was.
     - `posterior_paths`: for each observed `DiffusionEndpoint` the bridges, with axes `chain`, `draw`, the plates,
       `time`, `point` (unless states are vectors) and `coordinate`. An axis in which sites differ has the site's name in
       front, `wing_time`. Times that vary with the draws are a variable, `wing_times`.
 
-    **Errors:** `ValueError` for a kernel without a model, and for `paths` without such a site, or without its noise.
+    A `/` in a name, as `handlers.scope` makes them, becomes a `.`: in a `DataTree` and in a NetCDF file it would be a
+    group. `dims` and `coords` may be given with either.
+
+    **Errors:** `ValueError` for a kernel without a model, for `paths` without such a site, or without its noise, for
+    predictions that are not draws of this run, and for names that differ only in `/` and `.`.
     """
     model = getattr(mcmc.sampler, "model", None)
     require(callable(model), "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.")
     sites = sites_of(model, mcmc._args, mcmc._kwargs)
     observed = {name: site["value"] for name, site in sites.items() if _is_datum(site)}
     hidden = set() if noise else {name for name, site in sites.items() if is_noise(site)}
-    dims = _plates(sites) | (dims or {})
+    dims = {_plain(name): [_plain(axis) for axis in axes] for name, axes in (_plates(sites) | (dims or {})).items()}
+    coords = _plainly(coords or {})
     samples = mcmc.get_samples(group_by_chain=True)
     shape = next(iter(samples.values())).shape[:2]
 
@@ -67,14 +81,17 @@ def to_arviz(
         trace = numpyro.handlers.trace(at_values).get_trace(*mcmc._args, **mcmc._kwargs)
         return {name: (trace[name]["fn"], trace[name]["value"]) for name in names}
 
+    def masks(values, names):
+        return {name: _mask_of(law) for name, (law, _) in replay(values, names).items()}
+
     def log_likelihood(values, names):
         return {name: law.log_prob(value) for name, (law, value) in replay(values, names).items()}
 
     def bridges(values, names):
         return {name: (law.path(value), law.parts["ts"]) for name, (law, value) in replay(values, names).items()}
 
-    def visible(draws, shape=None):
-        return {k: v if shape is None else _regrouped(v, shape) for k, v in draws.items() if k not in hidden}
+    def visible(draws):
+        return {name: value for name, value in draws.items() if name not in hidden}
 
     def lost(samples):
         return {name: site["value"] for name, site in sites.items() if is_latent(site) and name not in samples}
@@ -87,7 +104,14 @@ def to_arviz(
 
     lacking = unknown(log_likelihood, observed, samples)
     known = [name for name in observed if name not in lacking]
+    masked = [name for name in observed if _mask_of(sites[name]["fn"]) is not None]
+    seen = _mapped(lambda draw: masks(lost(samples) | draw, masked), samples) if masked else {}
+    seen = {name: mask.any(axis=(0, 1)) for name, mask in seen.items()}
     datasets = {}
+    if known:
+        found = _mapped(lambda draw: log_likelihood(lost(samples) | draw, known), samples)
+        axes = {name: _leading_axes(name, value.ndim - 2, dims) for name, value in found.items()}
+        datasets["log_likelihood"] = _seen_only(found, seen, axes, coords)
     if paths is not None:
         paths, (draws, driving) = positive_integer(paths, "paths"), _with_noise(mcmc)
         places = np.linspace(0, len(draws) - 1, min(paths, len(draws))).astype(int)
@@ -102,15 +126,18 @@ def to_arviz(
         )
         found = _mapped(lambda draw: bridges(lost(driving) | draw, driven), driving, places)
         leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven}
-        datasets["posterior_paths"] = _labelled(found, leading, kept, coords or {})
+        datasets["posterior_paths"] = _labelled(found, leading, kept, coords)
     groups = {
         "posterior": visible(samples),
         "sample_stats": statistics(mcmc.get_extra_fields(group_by_chain=True), mcmc.sampler),
-        "log_likelihood": _mapped(lambda draw: log_likelihood(lost(samples) | draw, known), samples) if known else {},
-        "observed_data": observed,
+        "observed_data": {name: _without(value, seen.get(name)) for name, value in observed.items()},
     }
-    if posterior_predictive is not None:
-        groups["posterior_predictive"] = visible(posterior_predictive, shape)
+    if posterior_predictive:
+        ndims = {name: np.ndim(site["value"]) for name, site in sites.items()}
+        found = _by_chain(visible(posterior_predictive), ndims, shape)
+        axes = {name: _leading_axes(name, value.ndim - 2, dims) for name, value in found.items()}
+        variables = {name: (["chain", "draw", *axes[name]], value) for name, value in found.items()}
+        datasets["posterior_predictive"] = _dataset(variables, coords)
     if prior is not None:
         draws = {name: np.asarray(value)[None] for name, value in visible(prior).items()}
         groups["prior"] = {name: value for name, value in draws.items() if name not in observed}
@@ -142,14 +169,79 @@ def _plates(sites) -> dict:
 
 def _leading_axes(name, number, dims) -> list[str]:
     """Of one site: as many names as it has axes for its data."""
-    names = list(dims.get(name, ()))[:number]
+    names = list(dims.get(_plain(name), ()))[:number]
     return names + [f"{name}_dim_{i}" for i in range(len(names), number)]
 
 
-def _regrouped(draws, shape):
-    """Draws with chains and iterations in front."""
-    draws = np.asarray(draws)
-    return draws.reshape(shape + draws.shape[1:])
+def _by_chain(draws, ndims, shape) -> dict:
+    """Predictions with axes for chains and draws in front: `shape`, those of the run, or fewer."""
+    draws = {name: np.asarray(value) for name, value in draws.items()}
+    if not draws:
+        return {}
+    numbers = {value.ndim - ndims[name] for name, value in draws.items() if name in ndims}
+    if numbers not in ({1}, {2}):  # the model has other axes without its data
+        numbers = {2 if all(value.shape[:2] == shape for value in draws.values()) else 1}
+    number = numbers.pop()
+    leading = {value.shape[:number] for value in draws.values()}
+    require(
+        len(leading) == 1 and 0 not in min(leading),
+        f"`posterior_predictive` must hold the same draws of every site; got leading axes {sorted(leading)}.",
+    )
+    axes = leading.pop()
+    whole = axes in (shape, (shape[0] * shape[1],))
+    if not whole:
+        warnings.warn(
+            f"`posterior_predictive` holds draws {axes} of a run of {shape[0]} chains and {shape[1]} draws: its chains "
+            "and draws are not those of the posterior.",
+            stacklevel=3,
+        )
+    axes = shape if whole else (1,) * (2 - number) + axes
+    return {name: value.reshape(axes + value.shape[number:]) for name, value in draws.items()}
+
+
+def _mask_of(law):
+    """Which data count, booleans with the axes of the batch in front, or `None` where no mask is.
+
+    Axes that `to_event` has made part of a datum follow those of the batch.
+    """
+    if isinstance(law, AbstractNoiseDriven):
+        return law._mask
+    if not isinstance(law, (ExpandedDistribution, Independent, MaskedDistribution)):
+        return None
+    inner = _mask_of(law.base_dist)
+    if isinstance(law, Independent):
+        return inner
+    own = jnp.asarray(law._mask if isinstance(law, MaskedDistribution) else True)
+    if inner is None and isinstance(law, ExpandedDistribution):
+        return None
+    inner = jnp.ones((), bool) if inner is None else inner
+    inside = inner.shape[len(law.base_dist.batch_shape) :]
+    own = own.reshape(own.shape + (1,) * len(inside))
+    return jnp.broadcast_to(inner & own, law.batch_shape + inside)
+
+
+def _without(value, mask):
+    """The data of a site, NaN where they are masked."""
+    if mask is None or mask.all():
+        return value
+    mask = mask.reshape(mask.shape + (1,) * (np.ndim(value) - mask.ndim))
+    return np.where(mask, value, np.nan)
+
+
+def _seen_only(found, seen, axes, coords):
+    """A dataset of the log likelihoods of each site's data, without those that are masked."""
+    variables, labels = {}, {}
+    for name, values in found.items():
+        mask = seen.get(name, np.ones((), bool))
+        mask = mask.any(axis=tuple(range(values.ndim - 2, mask.ndim)))
+        if mask.all():
+            variables[name] = (["chain", "draw", *axes[name]], values)
+        elif mask.any():
+            variables[name] = (["chain", "draw", f"{name}_seen"], values[:, :, mask])
+            for axis, size, places in zip(axes[name], mask.shape, np.nonzero(mask), strict=True):
+                label = axis.removeprefix(f"{name}_")
+                labels[f"{name}_{label}"] = (f"{name}_seen", np.asarray(coords.get(axis, range(size)))[places])
+    return _dataset(variables, coords).assign_coords(labels)
 
 
 def _mapped(fn, samples, kept=None) -> dict:
@@ -164,8 +256,6 @@ def _mapped(fn, samples, kept=None) -> dict:
 
 def _labelled(found, leading, kept, coords):
     """A dataset of the bridges and times of each site, with axes `(chain, draw, ..., time, point, coordinate)`."""
-    import xarray
-
     grids = {name: _grid(path[0, 0], times, len(leading[name])) for name, (path, times) in found.items()}
     taken = set().union(*leading.values())
 
@@ -181,9 +271,16 @@ def _labelled(found, leading, kept, coords):
             labels[axes[0]] = times[0, 0]
         else:
             variables[f"{name}_times"] = (["chain", "draw", axes[0]], times)
+    return _dataset(variables, coords).assign_coords(labels)
+
+
+def _dataset(variables, coords):
+    """With labels for every axis: those given, where they are as many, or numbers."""
+    import xarray
+
     data = xarray.Dataset(variables)
     given = {axis: coords[axis] for axis, size in data.sizes.items() if len(coords.get(axis, ())) == size}
-    return data.assign_coords({axis: np.arange(size) for axis, size in data.sizes.items()} | given | labels)
+    return data.assign_coords({axis: np.arange(size) for axis, size in data.sizes.items()} | given)
 
 
 def _grid(path, times, number) -> dict:
@@ -193,10 +290,28 @@ def _grid(path, times, number) -> dict:
     return dict(zip(axes, path.shape[number:], strict=True)) | fixed
 
 
+def _plain(name: str) -> str:
+    return name.replace("/", ".")
+
+
+def _plainly(names) -> dict:
+    """A dictionary with plain names; `ValueError` if two of them are the same."""
+    plain = {_plain(name): value for name, value in names.items()}
+    same = sorted(name for name in names if name != _plain(name) and _plain(name) in names)
+    require(not same, f"{same} become names of other sites, `/` being written `.`: rename these sites.")
+    return plain
+
+
 def _from_groups(groups, datasets, coords, dims):
     import arviz
     import xarray
 
+    groups = {group: _plainly(values) for group, values in groups.items()}
+    datasets = {
+        group: data.rename({name: _plain(name) for name in (*data.variables, *data.dims) if "/" in name})
+        for group, data in datasets.items()
+        if data.data_vars
+    }
     if int(arviz.__version__.split(".")[0]) < 1:
         data = arviz.from_dict(**groups, coords=coords, dims=dims)
         if datasets:
