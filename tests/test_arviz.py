@@ -282,7 +282,7 @@ def masked_model():
 def masked():
     rng = np.random.default_rng(3)
     shapes = {"mean": (), "wing_noise": (3, 2, STEPS, 2, 1), "tail_unobserved": (3, 2)}
-    samples = {name: rng.normal(size=(2, 7, *shape)) for name, shape in shapes.items()}
+    samples = {name: rng.normal(size=(2, 40, *shape)) for name, shape in shapes.items()}
     return samples, nb.to_arviz(made_up_run(NUTS(masked_model), samples, ()), coords={"sides": ["left", "right"]})
 
 

@@ -215,6 +215,8 @@ def test_expand_mask_and_to_event_keep_the_noise():
     masked = law.mask(mask)
     assert masked.noise_prior().log_prob(z).shape == (2, 3)
     np.testing.assert_allclose(masked.given(z).log_prob(v), np.where(mask, full, 0))
+    paths, led = masked.given(z).path(v), law.given(z).path(v)
+    np.testing.assert_array_equal(paths, np.where(mask[:, None, None, None], led, np.nan))
     joint = masked.to_event(1)
     assert (
         joint.batch_shape == (2,) and joint.event_shape == (3, 3, 2) and joint.sample(jr.key(0)).shape == (2, 3, 3, 2)

@@ -38,9 +38,9 @@ def to_arviz(
 
     - `mcmc`: after `run`, with any kernel of a model. Sample statistics are what the run has collected:
       `extra_fields=nb.infer.fields(kernel)` asks for all.
-    - `prior`, `posterior_predictive`: dictionaries from `numpyro.infer.Predictive`. Those of the posterior may come from
-      flat draws or from draws by chain (`batch_ndims=2`), and from some of the draws: a warning says so, and flat ones
-      then count as one chain, since theirs are not known.
+    - `prior`, `posterior_predictive`: dictionaries from `numpyro.infer.Predictive`. Those of the posterior
+      may come from flat draws or from draws by chain (`batch_ndims=2`), and from some of the draws: a
+      warning says so, and flat ones then count as one chain, since theirs are not known.
     - `coords`, `dims`: as in ArviZ; plates name their axes.
     - `noise`: keep the driving noise in the posterior.
     - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all whose noise was kept;
@@ -313,7 +313,7 @@ def _from_groups(groups, datasets, coords, dims):
         if data.data_vars
     }
     if int(arviz.__version__.split(".")[0]) < 1:
-        data = arviz.from_dict(**groups, coords=coords, dims=dims)
+        data = arviz.from_dict(coords=coords, dims=dims, **groups)  # pyright: ignore[reportArgumentType]
         if datasets:
             data.add_groups(datasets)
         return data
