@@ -10,6 +10,7 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array
 
 from ._types import State, Structured
 
@@ -80,9 +81,21 @@ def promote(A: Structured, ndim: int, n: int) -> Structured:
     return diagonal_matrix(A, n) if A.ndim == 1 and ndim == 2 else A
 
 
+def safe_sqrt(x: Array) -> Array:
+    """√x whose derivative at exactly 0 is 0, where that of √x is infinite: of |y| = √y² the mean of both sides."""
+    zero = x == 0
+    # the inner `where` keeps the infinite slope, the outer one the value 1, out of the result
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, x)))
+
+
 def cholesky(S: Structured) -> Structured:
-    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite."""
-    return jnp.sqrt(S) if S.ndim < 2 else lax.linalg.cholesky(S, symmetrize_input=False)
+    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite, but for zeros of a diagonal one."""
+    return safe_sqrt(S) if S.ndim < 2 else lax.linalg.cholesky(S, symmetrize_input=False)
+
+
+def symmetric(S: Structured) -> Structured:
+    """½ (S + Sᵀ): the derivative of a factorisation holds for symmetric matrices only, and a parameter is any."""
+    return 0.5 * (S + S.T) if S.ndim == 2 else S
 
 
 def solve_lower(C: Structured, x: State, transposed: bool = False) -> State:

@@ -19,7 +19,7 @@ def test_derivative_of_the_drive(key):
     def f(A, X, Y, r, z):
         return drive(A, X @ X.T + jnp.eye(3), Y @ Y.T + jnp.eye(3), r, z)
 
-    check_grads(f, arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
+    check_grads(f, arguments, order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("over", [3, 4])

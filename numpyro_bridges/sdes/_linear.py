@@ -5,12 +5,14 @@
 The integrals are elementwise for a scalar or diagonal B, and by series and doubling otherwise.
 """
 
+from math import factorial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._checks import as_float, concrete, require, require_finite
-from .._linalg import apply, cholesky, compose, congruence, promote, transpose
+from .._linalg import apply, cholesky, compose, congruence, promote, symmetric, transpose
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
 from ._base import AbstractSDE, AffineStep, Transition, as_state_shift
@@ -20,9 +22,16 @@ _TERMS, _DOUBLINGS = 22, 20
 
 
 def _phi1(x: Array) -> Array:
-    """(eˣ − 1)/x, 1 at x = 0."""
-    safe = jnp.where(x == 0, 1.0, x)
-    return jnp.where(x == 0, 1.0, jnp.expm1(safe) / safe)
+    """φ₁(x) = (eˣ − 1)/x = ∫₀¹ e^{sx} ds, with its derivatives of every order.
+
+    Those of the quotient lose their digits near 0, at 0 half their value; within 1 the series Σ xⁿ/(n + 1)! has them.
+    """
+    near = jnp.abs(x) < 1
+    small, large = jnp.where(near, x, 0.0), jnp.where(near, 1.0, x)
+    series = jnp.zeros_like(x)
+    for n in reversed(range(_TERMS)):
+        series = series * small + 1 / factorial(n + 1)
+    return jnp.where(near, series, jnp.expm1(large) / large)
 
 
 def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array, Array, Array]:
@@ -88,7 +97,8 @@ class BrownianMotion(AbstractSDE):
         return jnp.zeros_like(x)
 
     def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
-        return cholesky(self.covariance_operator), self.covariance_operator
+        Q = symmetric(self.covariance_operator)
+        return cholesky(Q), Q
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         return jnp.zeros((), x.dtype), jnp.zeros_like(x)
@@ -180,9 +190,11 @@ class LinearSDE(AbstractSDE):
     def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
         step = self.exact_step(t0, t1, x)
         mean = apply(step.operator, x) + step.shift
-        if self.drift_operator.ndim == 0:
+        B, sigma = self.drift_operator, self.diffusion_operator
+        if B.ndim == 0 or (B.ndim == 1 and sigma.ndim < 2):
+            # σ times a positive number, smooth also where σ is 0, as a root of σ² is not
             dt = t1 - t0
-            factor = jnp.sqrt(dt * _phi1(2 * dt * self.drift_operator)) * self.diffusion_operator
+            factor = compose(jnp.sqrt(dt * _phi1(2 * dt * B)), sigma)
             return Transition(mean, factor, step.covariance)
         factor = _psd_cholesky(step.covariance)
         return Transition(mean, factor, congruence(factor, jnp.ones((), x.dtype)))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._checks import as_float, positive_integer, require, require_finite, require_positive
-from .._linalg import add, cholesky
+from .._linalg import add, cholesky, safe_sqrt
 from ..kernels import AbstractKernel
 
 
@@ -115,7 +115,7 @@ class SpectralNoise(AbstractNoise):
         dim = points.shape[1]
         period = self._period(kernel, covariance)
         omega = jnp.asarray(self._lattice(dim), points.dtype) * (2 * jnp.pi / period)
-        scale = jnp.sqrt(covariance.spectral_density(omega, dim) / period**dim)
+        scale = safe_sqrt(covariance.spectral_density(omega, dim) / period**dim)  # it underflows
         scale = jnp.concatenate([scale[:1], jnp.sqrt(2.0) * scale[1:]])
         phase = points @ omega.T
         return jnp.concatenate([scale[None] * jnp.cos(phase), (scale[None] * jnp.sin(phase))[:, 1:]], axis=1)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import floating, require, require_finite, require_instance
+from .._linalg import safe_sqrt
 
 
 class AbstractSpace(eqx.Module):
@@ -58,8 +59,8 @@ class AbstractSpace(eqx.Module):
         return self.inner(x, x)
 
     def norm(self, x: Float[Array, "n dim"]) -> Float[Array, ""]:
-        """‖x‖. Its gradient at x = 0 is NaN: differentiate `squared_norm` where x may vanish."""
-        return jnp.sqrt(self.squared_norm(x))
+        """‖x‖. Its gradient at x = 0, where it has a corner, is taken as 0."""
+        return safe_sqrt(self.squared_norm(x))
 
     def evaluate(self, x: Float[Array, "n dim"], s: ArrayLike) -> Float[Array, "m dim"]:
         """The points x(s_j) of the curve."""
