@@ -257,6 +257,89 @@ def test_noise_prior():
         prior.expand((3,))
 
 
+ENDS = np.array([0.5, 1.0, 2.5, 0.8])
+
+
+def end_density(end, v, x0=X0, rate=RATE, variance=0.05):
+    """log p(v | x0) at a time, of the process and the inexact match above."""
+    mean = MEAN + np.exp(-rate * end) * (x0 - MEAN)
+    spread = SIGMA**2 * (1 - np.exp(-2 * rate * end)) / (2 * rate) + variance
+    return stats.norm(mean, np.sqrt(spread)).logpdf(v).sum()
+
+
+OWN_TIMES = {
+    "t1": lambda **own: nb.DiffusionEndpoint(
+        SDE, X0, MATCHES["inexact"], t1=ENDS, num_steps=2, batch_shape=(4,), **own
+    ),
+    "t0 and t1": lambda **own: nb.DiffusionEndpoint(
+        SDE, X0, MATCHES["inexact"], t0=-ENDS, t1=np.zeros(4), num_steps=2, batch_shape=(4,), **own
+    ),
+    "ts": lambda **own: nb.DiffusionEndpoint(
+        SDE, X0, MATCHES["inexact"], ts=ENDS[:, None] * np.array([0.0, 0.3, 1.0]), batch_shape=(4,), **own
+    ),
+    "traced": lambda **own: jax.jit(
+        lambda t: nb.DiffusionEndpoint(SDE, X0, MATCHES["inexact"], t1=t, num_steps=2, batch_shape=(4,), **own)
+    )(ENDS),
+    "a mapped law": lambda **own: jax.vmap(
+        lambda t: nb.DiffusionEndpoint(SDE, X0, MATCHES["inexact"], t1=t, num_steps=2, **own)
+    )(ENDS),
+}
+
+
+@pytest.mark.parametrize("name", OWN_TIMES)
+def test_data_with_times_of_their_own(name):
+    """The guide of a linear SDE is exact, so that the density given the noise is the density."""
+    law = OWN_TIMES[name]()
+    v = datum_for(law, 3)
+    expected = [end_density(end, v[i]) for i, end in enumerate(ENDS)]
+    assert law.batch_shape == (4,) and law.event_shape == (3, 2)
+    np.testing.assert_allclose(law.given(noise_for(law)).log_prob(v), expected, atol=1e-6)
+    wide = law.expand((2, 4)).mask(np.array([[True], [False]]))
+    np.testing.assert_allclose(wide.given(noise_for(wide)).log_prob(v), [expected, np.zeros(4)], atol=1e-6)
+    assert law.times.shape == (4, 3) and np.allclose(law.times[:, -1] - law.times[:, 0], ENDS)
+
+
+def test_times_that_fit_no_batch():
+    own = {"batch_shape": (2,), "num_steps": 2}
+    with pytest.raises(ValueError, match=r"`t1` must be one time, or one for each.*need `batch_shape=\(4,\)`"):
+        nb.DiffusionEndpoint(SDE, X0, MATCHES["inexact"], t1=ENDS, num_steps=2)
+    with pytest.raises(ValueError, match=r"`t0` must be one time.*\(2,\) with `batch_shape=\(2,\)`; got shape \(4,\)"):
+        nb.DiffusionEndpoint(SDE, X0, MATCHES["inexact"], t0=ENDS, t1=3.0, **own)
+    with pytest.raises(ValueError, match=r"law \(1,\) of the batch: `t1` must be finite and later than `t0`"):
+        nb.DiffusionEndpoint(SDE, X0, MATCHES["inexact"], t1=np.array([1.0, -1.0]), **own)
+    with pytest.raises(ValueError, match=r"`ts` must be one grid, or one for each.*got shape \(3, 4\)"):
+        nb.DiffusionEndpoint(SDE, X0, MATCHES["inexact"], ts=np.ones((3, 4)))
+
+
+STACKS = {
+    "a law": lambda make: jax.vmap(make)(RATES),
+    "of a batch": lambda make: jax.vmap(lambda rate: make(rate, x0=STARTS[:2], batch_shape=(2,)))(RATES),
+    "expanded": lambda make: jax.vmap(lambda rate: make(rate).expand((2,)))(RATES),
+    "masked": lambda make: jax.vmap(lambda rate: make(rate).mask(rate < 2.0))(RATES),
+    "in scan": lambda make: jax.lax.scan(lambda _, rate: (None, make(rate)), None, RATES)[1],
+}
+
+
+@pytest.mark.parametrize("name", STACKS)
+def test_a_stack_of_laws_is_a_batch(name):
+    """What a transformation stacks has its axes in front of the law's own."""
+
+    def make(rate, **kwargs):
+        return endpoint(MATCHES["inexact"], nb.LinearSDE(-rate, SIGMA), guide=None, **kwargs)
+
+    law = STACKS[name](make)
+    batch = (4, 2) if name in ("of a batch", "expanded") else (4,)
+    z, v = noise_for(law), datum_for(law)
+    assert law.batch_shape == batch and v.shape == (*batch, 3, 2) and law.noise_prior().batch_shape == batch
+    variances = SIGMA**2 * (1 - np.exp(-2 * RATES)) / (2 * RATES) + 0.05
+    starts = np.stack([STARTS[:2]] * 4) if name == "of a batch" else np.broadcast_to(X0, (*batch, 3, 2))
+    shape = (4,) + (1,) * (len(batch) + 1)
+    normal = dist.Normal(np.exp(-RATES).reshape(shape) * starts, np.sqrt(variances).reshape(shape))
+    np.testing.assert_allclose(law.given(z).log_prob(v), normal.log_prob(v).sum((-1, -2)), atol=1e-6)
+    again = jax.vmap(lambda law, z, v: law.given(z).log_prob(v))(law, z, v)
+    np.testing.assert_allclose(again, law.given(z).log_prob(v), atol=1e-10)
+
+
 # A pytree
 
 
@@ -354,7 +437,7 @@ def test_shapes_that_do_not_fit():
         law.given(noise_for(law)).log_prob(X0[:2])
     with pytest.raises(ValueError, match=r"`noise` must have shape \(..., 4, 3, 2\).*got \(3, 3, 2\)"):
         law.given(noise_for(law)[:3])
-    with pytest.raises(ValueError, match="`reinterpreted_batch_ndims` must be at most 0"):
+    with pytest.raises(ValueError, match="`reinterpreted_batch_ndims` must be a number from 0 to 0"):
         law.to_event(1)
 
 
@@ -423,3 +506,28 @@ def test_models_of_observation_only():
         endpoint(nb.InexactMatch(0.1).at(X0))
     with pytest.raises(ValueError, match="`x0` must be finite"):
         endpoint(nb.InexactMatch(0.1), x0=np.full((3, 2), np.nan))
+
+
+BAD = {
+    "sde": (lambda: nb.DiffusionEndpoint("s", X0, MATCHES["inexact"], t1=1.0, num_steps=2), "`sde` must be an SDE"),
+    "t1": (lambda: nb.DiffusionEndpoint(SDE, X0, MATCHES["inexact"], t1="1", num_steps=2), "`t1` must be a number"),
+    "batch_shape": (lambda: endpoint(MATCHES["inexact"], batch_shape=3), "`batch_shape` must be a tuple of sizes"),
+    "batch sizes": (lambda: endpoint(MATCHES["inexact"], batch_shape=(2.0,)), "`batch_shape` must be a tuple of sizes"),
+    "batched": (lambda: endpoint(MATCHES["inexact"], batched="x0"), "`batched` must be a tuple of names"),
+    "key": (lambda: endpoint(MATCHES["inexact"]).sample(0), "`key` must be a random key"),
+    "no key": (lambda: endpoint(MATCHES["inexact"]).sample_with_noise(None), "`key` must be a random key"),
+    "key of noise": (lambda: endpoint(MATCHES["inexact"]).noise_prior().sample(0), "`key` must be a random key"),
+    "sample_shape": (lambda: endpoint(MATCHES["inexact"]).sample(jr.key(0), 3), "`sample_shape` must be a tuple"),
+    "expand": (lambda: endpoint(MATCHES["inexact"]).expand(3), "`batch_shape` must be a tuple of sizes"),
+    "mask": (lambda: endpoint(MATCHES["inexact"]).mask(np.ones(3)), "`mask` must hold booleans"),
+    "to_event": (lambda: endpoint(MATCHES["inexact"]).to_event("all"), "`reinterpreted_batch_ndims` must be a number"),
+    "noise": (lambda: endpoint(MATCHES["inexact"]).given("z"), "`noise` must be a number"),
+    "value": (lambda: endpoint(MATCHES["inexact"]).log_prob(X0 * 1j), "`value` must be a number"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_arguments_of_another_kind(name):
+    call, message = BAD[name]
+    with pytest.raises(ValueError, match=message):
+        call()

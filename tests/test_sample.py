@@ -8,12 +8,14 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 from numpyro import handlers
+from numpyro.contrib.control_flow import scan
 from numpyro.diagnostics import effective_sample_size
 from numpyro.infer import MCMC, NUTS, SVI, Predictive, Trace_ELBO, log_likelihood
 from numpyro.infer.autoguide import AutoDelta, AutoNormal
 from numpyro.infer.util import log_density
 
 import numpyro_bridges as nb
+from numpyro_bridges.infer._posterior import driven_by, split
 
 pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
 
@@ -21,6 +23,7 @@ N, STEPS = 5, 3
 RATE, SIGMA, SPREAD = 0.8, 0.6, 0.05
 GUIDE = nb.FrozenGuide(nb.BrownianMotion(0.5))  # not the process's own: the weight depends on the noise
 SEEN = nb.InexactMatch(SPREAD)
+SDE = nb.LinearSDE(-RATE, SIGMA)
 DATA = np.random.default_rng(0).normal(0.5, 0.5, (N, 2))
 NOISE = np.random.default_rng(1).standard_normal((N, STEPS, 2, 1))
 
@@ -180,7 +183,158 @@ def test_own_parameters_of_each_specimen():
     assert float(joint(means)) == pytest.approx(float(joint_expected), abs=1e-10)
 
 
+def test_data_of_other_kinds():
+    """Whole numbers and lists are data as well."""
+    whole = np.arange(2 * N).reshape(N, 2)
+    expected = trace_of(model, 1.0 * whole)["wing"]["value"]
+    for observed in (whole, whole.tolist(), whole.astype(np.float32)):
+        found = trace_of(model, observed)["wing"]
+        np.testing.assert_array_equal(found["value"], expected)
+        assert found["value"].dtype == np.float32 or found["value"].dtype == float
+        assert found["fn"].log_prob(found["value"]).shape == (N,)
+
+
+def chain(ys):
+    """Each transition starts where the one before was seen to end."""
+    mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
+
+    def step(x, y):
+        sde = nb.LinearSDE(-RATE, SIGMA, RATE * mean)
+        one = nb.DiffusionEndpoint(sde, x, SEEN, t1=1.0, num_steps=STEPS, guide=GUIDE)
+        return nb.sample("wing", one, obs=y), None
+
+    scan(step, jnp.zeros(2), ys)
+
+
+def test_a_scan_is_its_unrolled_loop():
+    starts = np.concatenate([np.zeros((1, 2)), DATA[:-1]])
+
+    def unrolled(mean, noise):
+        sde = nb.LinearSDE(-RATE, SIGMA, RATE * mean)
+        laws = nb.DiffusionEndpoint(
+            sde, starts, SEEN, t1=1.0, num_steps=STEPS, guide=GUIDE, batch_shape=(N,), batched=("x0",)
+        )
+        return laws.given(noise).log_prob(DATA)
+
+    params = {"mean": 0.3, "wing_noise": jnp.asarray(NOISE)}
+    prior, noise = priors()
+    expected = unrolled(0.3, NOISE)
+    found, trace = log_density(chain, (jnp.asarray(DATA),), {}, params)
+    np.testing.assert_allclose(trace["wing"]["fn"].log_prob(trace["wing"]["value"]), expected, atol=1e-6)
+    assert float(found) == pytest.approx(float(prior + noise.sum() + expected.sum()), abs=1e-5)
+    rest, weights = split(chain, (jnp.asarray(DATA),), {}, params)
+    assert float(rest) == pytest.approx(-float(prior), abs=1e-10)
+    assert float(weights["wing"]) == pytest.approx(float(expected.sum()), abs=1e-5)
+    assert driven_by(chain, (jnp.asarray(DATA),), {}, params, ["wing_noise"]) == {"wing_noise": "wing"}
+
+
 # What is refused
+
+
+def in_a_plate(build, size=3, **site):
+    """A law built of a parameter of each datum, three of them."""
+    with numpyro.plate("specimens", size):
+        own = numpyro.sample("own", dist.Uniform(0.1, 0.5), **site)
+        law = build(own)
+        return nb.sample("wing", law, obs=np.zeros((size, *law.event_shape)))
+
+
+def law_of(sde=SDE, x0=np.zeros(2), match=SEEN, **kwargs):
+    kwargs = {"t1": 1.0, "num_steps": 5} | kwargs if "ts" not in kwargs else kwargs
+    return nb.DiffusionEndpoint(sde, x0, match, **kwargs)
+
+
+def drift(t, x, rates):
+    return -rates[0] * x
+
+
+TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+HIDDEN = {
+    "x0": ("x0", lambda own: law_of(x0=np.zeros(3) + own)),
+    "x0, itself": ("x0", lambda own: law_of(x0=own)),
+    "x0, rows": ("x0", lambda own: law_of(x0=np.zeros((3, 2)) + own[:, None])),
+    "x0, columns": ("x0", lambda own: law_of(x0=np.zeros((2, 3)) + own)),
+    "drift": ("sde", lambda own: law_of(nb.LinearSDE(-own, SIGMA), np.zeros(3))),
+    "drift, matrix": ("sde", lambda own: law_of(nb.LinearSDE(-jnp.diag(own), SIGMA), np.zeros(3))),
+    "shift, columns": ("sde", lambda own: law_of(nb.LinearSDE(-1.0, SIGMA, np.zeros((2, 3)) + own), np.zeros((2, 3)))),
+    "args": ("sde", lambda own: law_of(nb.SDE(drift, lambda t, x, p: 0.5, jnp.stack([own, own])), np.zeros(3))),
+    "weights": (
+        "sde",
+        lambda own: law_of(nb.LinearSDE(-1.0, SIGMA, space=nb.Landmarks(3, 2, weights=own)), TRIANGLE),
+    ),
+    "weights of the match": (
+        "match",
+        lambda own: law_of(match=nb.InexactMatch(SPREAD, np.eye(4)[:3], space=nb.Landmarks(3, 1, own)), x0=np.zeros(4)),
+    ),
+    "corner of a grid": (
+        "sde",
+        lambda own: law_of(
+            nb.KunitaFlow(nb.Landmarks(2, 3), nb.GaussianKernel(1.0, 1.0), noise=nb.GridNoise(-own - 2, 3.0, 2)),
+            np.eye(3)[:2],
+        ),
+    ),
+    "variance": ("match", lambda own: law_of(match=nb.InexactMatch(own), x0=np.zeros(3))),
+    "operator": ("match", lambda own: law_of(match=nb.InexactMatch(SPREAD, own[None]), x0=np.zeros(3))),
+    "cuts": ("match", lambda own: law_of(match=nb.IntervalCensored(jnp.cumsum(own)))),
+    "guide": ("guide", lambda own: law_of(guide=nb.FrozenGuide(nb.LinearSDE(-jnp.diag(own)[:2, :2], own[:2, None] * own)))),
+    "ts": ("ts", lambda own: law_of(ts=jnp.cumsum(own))),
+    "t1": ("t1", lambda own: law_of(t1=own)),
+    "t0": ("t0", lambda own: law_of(t0=-own)),
+    "amplitude": (
+        "amplitude",
+        lambda own: law_of(nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(own, 1.0)), TRIANGLE),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+@pytest.mark.parametrize("how", ["sampled", "observed"])
+def test_no_part_of_a_law_hides_an_axis(name, how):
+    part, build = HIDDEN[name]
+    site = {} if how == "sampled" else {"obs": np.array([0.2, 0.3, 0.4])}
+    with pytest.raises(ValueError, match=f"`{part}` (holds an array of shape|must be)"):
+        trace_of(in_a_plate, build, **site)
+
+
+def test_axes_that_hide_nothing():
+    """Equal sizes by chance: of the plate, the state, its columns and the grid."""
+
+    def shared(x0, **kwargs):
+        with numpyro.plate("specimens", 3):
+            nb.sample("first", law_of(x0=x0, **kwargs), obs=np.zeros((3, *x0.shape)))
+            return nb.sample("wing", law_of(x0=x0, **kwargs), obs=np.zeros((3, *x0.shape)))
+
+    for x0 in (np.zeros(3), np.zeros((3, 2)), np.zeros((2, 3))):
+        assert trace_of(shared, x0)["wing"]["value"].shape == (3, *x0.shape)
+    assert trace_of(shared, np.zeros(2), ts=np.array([0.0, 0.5, 1.0]))["wing"]["value"].shape == (3, 2)
+    declared = {
+        "nothing": lambda own: law_of(x0=np.zeros(3), batched=()),
+        "grid of its own": lambda own: law_of(num_steps=2),
+        "vmap": lambda own: law_of(
+            jax.vmap(lambda a: nb.LinearSDE(-a, SIGMA))(own), np.zeros(3), batch_shape=(3,), batched=("sde",)
+        ),
+        "guide of an SDE of its own": lambda own: law_of(
+            jax.vmap(lambda a: nb.LinearSDE(-a, SIGMA))(own), np.zeros(4), batch_shape=(3,), guide=GUIDE
+        ),
+    }
+    for build in declared.values():
+        assert trace_of(in_a_plate, build)["wing"]["value"].shape[0] == 3
+    alone = trace_of(in_a_plate, lambda own: law_of(x0=np.zeros(1) + own), size=1)
+    assert alone["wing"]["value"].shape == (1, 1), "a plate of one is no batch"
+
+
+def test_noise_that_was_dropped():
+    message = "`wing_noise` has no value.*do not hold the noise that drives `wing`.*no `~z.wing_noise`"
+    with pytest.raises(ValueError, match=message):
+        log_likelihood(model, {"mean": jnp.zeros(4)}, DATA)
+    with pytest.raises(ValueError, match=message):
+        log_density(model, (DATA,), {}, {"mean": 0.0})
+
+
+def test_data_of_no_kind():
+    for observed in (DATA.astype(str), DATA * 1j, DATA > 0):
+        with pytest.raises(ValueError, match="`obs` of site `wing` must be a number or an array"):
+            trace_of(model, observed)
 
 
 def test_errors_name_the_site():

@@ -6,12 +6,17 @@ what is written for one datum is mapped over it.
 """
 
 import itertools
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
-from .._checks import require
+from .._checks import floating, require, words
+from ..guiding import AbstractGuide
+from ..sdes import AbstractSDE
 from ..spaces import AbstractSpace
 
 
@@ -92,10 +97,43 @@ def _carries(part, batch_shape) -> bool:
     return bool(arrays) and all(a.shape[: len(batch_shape)] == batch_shape for a in arrays)
 
 
-def parameters(part):
-    """Arrays that may be parameters; those of a space are not."""
-    leaves = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, AbstractSpace))
+def stacked(part, axes, inner, own):
+    """A part whose arrays have axes of a stack in front, and then the part's own batch axes: both, then `inner`."""
+
+    def widened(a):
+        if not eqx.is_array(a):
+            return a
+        rest = a.shape[len(axes) + len(own) :]
+        a = jnp.reshape(a, axes + (1,) * (len(inner) - len(own)) + own + rest)
+        return jnp.broadcast_to(a, axes + inner + rest)
+
+    return jax.tree.map(widened, part)
+
+
+def parameters(part, with_spaces=False):
+    """Arrays that may be parameters. Those of a guide only lead the path, and may be of any shape but for an SDE's."""
+    if isinstance(part, AbstractGuide):
+        nodes = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, AbstractSDE))
+        return [leaf for node in nodes if isinstance(node, AbstractSDE) for leaf in parameters(node, with_spaces)]
+    leaves = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, AbstractSpace) and not with_spaces)
     return [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
+
+
+def as_shape(value, name, smallest=1) -> tuple[int, ...]:
+    """A tuple of sizes; `ValueError` for anything else, a number included."""
+    good = isinstance(value, Iterable) and not isinstance(value, (str, bytes, dict))
+    sizes = tuple(value) if good else ()
+    good = good and all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= smallest for n in sizes)
+    require(good, f"`{name}` must be a tuple of sizes, such as `(3,)`; got {words(value)}.")
+    return tuple(int(n) for n in sizes)
+
+
+def as_datum(value, name):
+    """An array of floats, which stays known where a program is traced."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)):
+        return floating(value, name)
+    with jax.ensure_compile_time_eval():
+        return floating(value, name)
 
 
 def broadcasts(small, large) -> bool:

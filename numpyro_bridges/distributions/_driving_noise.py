@@ -6,10 +6,14 @@ import jax.random as jr
 import numpyro.distributions as dist
 from numpyro.distributions import constraints
 
-from .._checks import require
+from .._checks import require, require_key
 from ._batch import broadcasts
 
 _LOG_2PI = 1.8378770664093453
+
+
+class MissingNoise(ValueError):
+    """The noise has no value, and there is no random key to draw one."""
 
 
 class DrivingNoise(dist.Distribution):
@@ -26,6 +30,9 @@ class DrivingNoise(dist.Distribution):
         return constraints.independent(constraints.real, self.event_dim)
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()):
+        if key is None:
+            raise MissingNoise("the noise has no value, and there is no random key to draw one.")
+        require_key(key)
         return jr.normal(key, self.shape(sample_shape))
 
     def log_prob(self, value, intermediates=None):

@@ -8,18 +8,20 @@ the guided bridge to v, so that
 p being the density that `sample` draws from: N(z; 0, I) exp(log_prob(v | z)) is an exact data augmentation.
 """
 
+from collections.abc import Iterable
+
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from .._checks import as_float, require, require_finite
+from .._checks import as_float, concrete, require, require_finite, require_instance, words
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractMatch
 from ..guiding import AbstractGuide, time_grid
 from ..sdes import AbstractSDE, simulate
-from ._batch import find_batched, one_of
+from ._batch import as_datum, as_shape, find_batched, one_of
 from ._noise_driven import AbstractNoiseDriven
 
 
@@ -31,10 +33,12 @@ class DiffusionEndpoint(AbstractNoiseDriven):
     - `sde`: an `AbstractSDE`.
     - `x0`: `(n, dim)` or `(n,)`.
     - `match`: how the end state is seen, an `ExactMatch`, `InexactMatch` or `IntervalCensored`; the datum is `obs=`.
-    - `t1`, `t0`, `num_steps`, `ts`, `guide`: as for `GuidedBridge`.
+    - `t1`, `t0`, `num_steps`, `ts`, `guide`: as for `GuidedBridge`. Data with times of their own are a batch: with
+      `batch_shape=(B,)`, `t1` and `t0` may be `(B,)`, and `ts` `(B, K + 1)`.
     - `batch_shape`: leading axes of a batch of laws with starts or SDEs of their own. Exchangeable data need none: a
       plate is enough. With `batch_shape=(B,)`, `x0` may be `(B, n, dim)`, and `sde`, `match` and `guide` may be what
-      `jax.vmap` of a constructor returns, every array with the batch axis in front. All else is shared.
+      `jax.vmap` of a constructor returns, every array with the batch axis in front. All else is shared. The law
+      itself may be made by `jax.vmap` too: its batch is then what it was mapped over.
     - `batched`: names of the parts that carry it, such as `("sde", "x0")`; by default found from the shapes, where they
       leave no doubt.
 
@@ -68,16 +72,31 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         match.check_density()
         x0 = as_float(x0, "x0")
         require_finite(x0, "x0")
-        batch_shape = tuple(batch_shape)
+        require_instance(sde, AbstractSDE, "sde", "an SDE, such as `LinearSDE(drift, diffusion)`")
+        batch_shape = as_shape(batch_shape, "batch_shape")
+        batched = _names(batched)
         parts = {"sde": sde, "x0": x0, "match": match, "guide": guide}
         names = find_batched(parts, batch_shape, batched, _check)
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
         datum = jnp.zeros(_seen(one).shape)
         exact = one["match"].at(datum).exact
-        parts["ts"] = one["ts"] = time_grid(t0, t1, num_steps, ts, graded=exact)
+        times = {"t0": t0, "t1": t1, "ts": ts}
+        parts["ts"], own = _grids(times, batch_shape, num_steps=num_steps, graded=exact)
+        names += ("ts",) if own else ()
+        one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
         noise_shape = _bridge(one, datum).noise_shape
         declared = batched is not None
-        super().__init__(parts, names, declared, batch_shape, datum.shape, noise_shape, validate_args)
+        plain = ("ts",) if ts is None else ()
+        super().__init__(parts, names, declared, batch_shape, datum.shape, noise_shape, validate_args, plain)
+
+    @property
+    def times(self):
+        """The times of a path, `(num_steps + 1,)`; with the batch axes in front where data have their own."""
+        ts = self.parts["ts"]
+        if "ts" not in self._batched:
+            return ts
+        inner = (1,) * (len(self._full_shape) - len(self._own_shape))
+        return jnp.broadcast_to(ts.reshape(inner + ts.shape), self._full_shape + ts.shape[-1:])
 
     def path(self, observed):
         """The bridges to `observed` that the bound noise drives, batch axes and then `(num_steps + 1, n, dim)`.
@@ -85,6 +104,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         NaN where the law is masked: the datum says nothing of that path, and no bridge leads to it.
         """
         require(self.noise is not None, "`path` needs the noise: use `law.given(noise)`.")
+        observed = as_datum(observed, "observed")
         self._check_value(observed)
         observed = jnp.broadcast_to(observed, self.shape())
         path = self._over_batch(_path, self._full_shape, observed, self.noise)
@@ -117,6 +137,51 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         """Entries are checked one by one, so that many data are one datum with many columns."""
         rows = np.moveaxis(values, 0, -1)
         parts["match"].at(rows.reshape(len(rows), -1) if len(values) > 1 else values[0])
+
+
+def _names(batched) -> tuple[str, ...] | None:
+    """The declared parts. Times show by their shapes whether they are batched."""
+    if batched is None:
+        return None
+    several = isinstance(batched, Iterable) and not isinstance(batched, (str, bytes))
+    names: list = list(batched) if several else [batched]
+    good = several and all(isinstance(name, str) for name in names)
+    require(good, f"`batched` must be a tuple of names, such as `('x0',)`; got {words(batched)}.")
+    return tuple(name for name in names if name not in ("t0", "t1", "ts"))
+
+
+def _grids(times, batch_shape, **settings):
+    """The time grid, or one for each law of a batch, and whether it is one each."""
+    own, shared = {}, {}
+    for name, value in times.items():
+        shape = () if value is None else np.shape(value)
+        inner = shape[len(shape) - 1 :] if name == "ts" else ()
+        batch = shape[: len(shape) - len(inner)]
+        require(
+            batch in ((), batch_shape),
+            f"`{name}` must be {'one grid' if inner else 'one time'}, or one for each law of a batch, "
+            f"{batch_shape + inner} with `batch_shape={batch_shape}`; got shape {shape}. Data with times of their own "
+            f"need `batch_shape={batch}`.",
+        )
+        (own if batch else shared)[name] = value
+    if not own:
+        return time_grid(**shared, **settings), False
+
+    def grid(own):
+        return time_grid(**shared, **own, **settings)
+
+    if any(concrete(value) is None for value in own.values()):
+        one = grid
+        for _ in batch_shape:
+            one = jax.vmap(one)
+        return one({name: jnp.asarray(value) for name, value in own.items()}), True
+    grids = []
+    for index in np.ndindex(batch_shape):
+        try:
+            grids.append(grid({name: np.asarray(value)[index] for name, value in own.items()}))
+        except ValueError as e:
+            raise ValueError(f"law {index} of the batch: {e}") from e
+    return jax.tree.map(lambda *a: jnp.stack(a).reshape(batch_shape + a[0].shape), *grids), True
 
 
 def _bridge(parts, value) -> GuidedBridge:

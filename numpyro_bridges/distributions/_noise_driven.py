@@ -2,6 +2,7 @@
 
 import copy
 import math
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,8 @@ import numpyro.distributions as dist
 from jaxtyping import Array
 from numpyro.distributions import constraints
 
-from .._checks import concrete, require
-from ._batch import broadcasts, map_batch, one_of, parameters
+from .._checks import concrete, floating, require, require_key, words
+from ._batch import as_datum, as_shape, broadcasts, map_batch, one_of, parameters, stacked
 from ._driving_noise import DrivingNoise
 
 
@@ -20,18 +21,61 @@ class AbstractNoiseDriven(dist.Distribution):
     """The law of an observation. Its density given standard normal noise averages over the noise to that of `sample`.
 
     A subclass says, for the parts of one law, how to simulate, how to weigh and what a datum must be.
+
+    What `jax.vmap` and `lax.scan` stack into one law is a batch of laws, their axes in front of its own.
     """
 
     arg_constraints = {}
-    pytree_data_fields = ("parts", "noise", "_mask")
-    pytree_aux_fields = ("_batched", "_declared", "_own_shape", "_noise_shape", "_moved")
+    pytree_data_fields = ("parts", "noise", "_mask", "_stack")
+    pytree_aux_fields = ("_batched", "_declared", "_plain", "_own_shape", "_noise_shape", "_moved")
+    _single = None
 
-    def __init__(self, parts, batched, declared, batch_shape, event_shape, noise_shape, validate_args=None):
+    def __init__(
+        self,
+        parts,
+        batched,
+        declared,
+        batch_shape,
+        event_shape,
+        noise_shape,
+        validate_args=None,
+        plain=(),
+    ):
         self.parts, self.noise, self._mask = parts, None, None
+        self._stack = np.zeros(())  # gets the axes that a transformation puts in front of all arrays
         self._batched, self._declared = batched, declared
+        self._plain = plain  # parts made of scalars, which no parameter of a datum can have broadcast
         self._own_shape, self._noise_shape, self._moved = batch_shape, noise_shape, 0
         super().__init__(batch_shape, event_shape, validate_args=validate_args)
-        self._refuse_hidden_axes(batch_shape)
+        self.refuse_hidden_axes(batch_shape, names=("sde", "match"))
+
+    def tree_flatten(self):
+        # a stack is taken apart again as the single law that it was made of
+        return super().tree_flatten() if self._single is None else self._single.tree_flatten()
+
+    @classmethod
+    def tree_unflatten(cls, aux_data, params):
+        law = cast(AbstractNoiseDriven, super().tree_unflatten(aux_data, params))
+        stack = law._stack
+        known = isinstance(stack, (jax.Array, np.ndarray))  # no placeholder of jax's
+        return law._as_batch(stack.shape) if known and stack.ndim else law
+
+    def _as_batch(self, axes):
+        """The batch of laws whose arrays all have the axes of a stack in front."""
+        inner = (1,) * (len(self._full_shape) - len(self._own_shape)) + self._own_shape
+        law = self._replace(
+            parts={
+                name: stacked(part, axes, inner, self._own_shape if name in self._batched else ())
+                for name, part in self.parts.items()
+            },
+            _batched=tuple(self.parts),
+            _own_shape=axes + inner,
+            _batch_shape=axes + self.batch_shape,
+            _declared=True,
+            _stack=np.zeros(()),
+        )
+        law._single = self
+        return law
 
     @staticmethod
     def _simulate(parts, key):
@@ -74,7 +118,7 @@ class AbstractNoiseDriven(dist.Distribution):
     def given(self, noise):
         """The same law with its noise bound, so that it has a `log_prob`. Leading axes of the noise widen the batch."""
         event = self.event_shape[: self._moved] + self._noise_shape
-        noise = jnp.asarray(noise)
+        noise = floating(noise, "noise")
         k = noise.ndim - len(event)
         require(
             k >= 0 and noise.shape[k:] == event,
@@ -106,6 +150,7 @@ class AbstractNoiseDriven(dist.Distribution):
 
         It is no density of `value` at fixed noise. Where the law is masked it is 0, whatever the value, NaN included.
         """
+        value = as_datum(value, "value")
         self._check_value(value)
         require(
             self.noise is not None,
@@ -124,12 +169,15 @@ class AbstractNoiseDriven(dist.Distribution):
         return jnp.sum(log_prob, axis=tuple(range(-self._moved, 0)))
 
     def expand(self, batch_shape):
-        return self._widened(tuple(batch_shape) + self.event_shape[: self._moved])
+        return self._widened(as_shape(batch_shape, "batch_shape") + self.event_shape[: self._moved])
 
     def mask(self, mask):
         if mask is True:
             return self
-        mask = jnp.asarray(mask, bool)
+        known = mask if isinstance(mask, jax.Array) else np.asarray(mask)
+        booleans = known.dtype == np.bool_
+        require(booleans, f"`mask` must hold booleans, True where a datum counts; got {words(mask)}.")
+        mask = jnp.asarray(known)
         law = self.expand(jnp.broadcast_shapes(mask.shape, self.batch_shape))
         mask = jnp.broadcast_to(mask, law.batch_shape)
         mask = jnp.broadcast_to(mask.reshape(mask.shape + (1,) * law._moved), law._full_shape)
@@ -138,12 +186,17 @@ class AbstractNoiseDriven(dist.Distribution):
     def to_event(self, reinterpreted_batch_ndims=None):
         n = len(self.batch_shape)
         k = n if reinterpreted_batch_ndims is None else reinterpreted_batch_ndims
-        require(0 <= k <= n, f"`reinterpreted_batch_ndims` must be at most {n}, the number of batch axes; got {k}.")
+        good = isinstance(k, (int, np.integer)) and 0 <= k <= n
+        require(
+            good,
+            f"`reinterpreted_batch_ndims` must be a number from 0 to {n}, the number of batch axes; got {words(k)}.",
+        )
         batch, moved = self.batch_shape[: n - k], self.batch_shape[n - k :]
         return self._replace(_batch_shape=batch, _event_shape=moved + self.event_shape, _moved=self._moved + k)
 
     def _replace(self, **fields):
         law = copy.copy(self)
+        law._single = None
         for name, value in fields.items():
             setattr(law, name, value)
         return law
@@ -158,7 +211,7 @@ class AbstractNoiseDriven(dist.Distribution):
         if full == old:
             return self
         require(broadcasts(old, full), f"a law of batch shape {old} cannot be expanded to {full}.")
-        self._refuse_hidden_axes(full)
+        self.refuse_hidden_axes(full, names=("sde", "match"))
         noise, mask = self.noise, self._mask
         if noise is not None:
             require(
@@ -171,22 +224,30 @@ class AbstractNoiseDriven(dist.Distribution):
         mask = mask if mask is None else jnp.broadcast_to(mask, full)
         return self._replace(_batch_shape=full[: len(full) - self._moved], noise=noise, _mask=mask)
 
-    def _refuse_hidden_axes(self, full):
-        """A shared part with an axis as long as one of the batch may be a parameter drawn inside the plate."""
+    def refuse_hidden_axes(self, batch, drawn="", names=None) -> None:
+        """`ValueError` where a shared part has an axis as long as one of the batch.
+
+        It may be a parameter of each datum, which would be broadcast into the state. The SDE and the match are refused
+        on sight. A start, a grid or a space has axes of its own always, and is refused where a site, `drawn`, shows
+        that there are parameters of each datum.
+        """
         if self._declared:
             return
-        sizes = set(full) - {1}
-        for name in {"sde", "match"} & set(self.parts) - set(self._batched):
-            for leaf in parameters(self.parts[name]):
+        sizes = set(batch) - {1}
+        for name in self.parts if names is None else names:
+            part = None if name in self._batched + self._plain else self.parts.get(name)
+            for leaf in parameters(part, with_spaces=names is None):
                 require(
-                    leaf.ndim == 0 or leaf.shape[0] not in sizes,
-                    f"`{name}` holds an array of shape {leaf.shape} and is used in a batch {full}. A parameter drawn "
-                    f"inside the plate would be broadcast into the state: build one `{name}` for each datum by "
-                    "`jax.vmap`, and give `batch_shape`. If the array belongs to every datum, say `batched=()`.",
+                    sizes.isdisjoint(leaf.shape),
+                    f"`{name}` holds an array of shape {leaf.shape} and is used in a batch {tuple(batch)}"
+                    f"{drawn and f', in which `{drawn}` is drawn'}. A parameter drawn inside the plate would be "
+                    f"broadcast into the state: build one `{name}` for each datum by `jax.vmap`, and give "
+                    f"`batch_shape`. If the array belongs to every datum, say `batched={self._batched}`.",
                 )
 
     def _keys(self, key, sample_shape):
-        shape = tuple(sample_shape) + self._full_shape
+        require_key(key)
+        shape = as_shape(sample_shape, "sample_shape", smallest=0) + self._full_shape
         return shape, jr.split(key, shape)
 
     def _over_batch(self, one, batch_shape, *arrays):

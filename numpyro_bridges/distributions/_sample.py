@@ -1,10 +1,13 @@
 """Sites with driving noise: a primitive, and a reparametrisation handler that does the same for `numpyro.sample`."""
 
-import numpy as np
 import numpyro
+from numpyro import handlers
 from numpyro.infer.reparam import Reparam
+from numpyro.primitives import _PYRO_STACK
 
 from .._checks import require
+from ._batch import as_datum
+from ._driving_noise import DrivingNoise, MissingNoise
 from ._noise_driven import AbstractNoiseDriven
 
 
@@ -24,7 +27,7 @@ def sample(name: str, law: AbstractNoiseDriven, obs=None, *, infer: dict | None 
 
     **Returns:** the observation.
     """
-    law = _with_noise(name, law, obs)
+    law, obs = _with_noise(name, law, obs)
     return numpyro.sample(name, law, obs=obs, infer=infer)
 
 
@@ -35,20 +38,48 @@ class NoiseReparam(Reparam):
     """
 
     def __call__(self, name, fn, obs):
-        return _with_noise(name, fn, obs), obs
+        return _with_noise(name, fn, obs)
 
 
 def _with_noise(name, law, obs):
+    """The law with its noise bound, and the datum as an array."""
     require(
         isinstance(law, AbstractNoiseDriven),
         f"site `{name}`: the law must be driven by noise, such as `DiffusionEndpoint`; got {type(law).__name__}. "
         "Wrap a law by its own methods, `law.expand`, `law.mask` and `law.to_event`, which keep the noise.",
     )
-    noise = numpyro.sample(f"{name}_noise", law.noise_prior(), infer={"driving_noise": True})
+    site = f"{name}_noise"
+    try:
+        with handlers.trace() as own:
+            noise = numpyro.sample(site, law.noise_prior(), infer={"driving_noise": True})
+    except MissingNoise as e:
+        raise ValueError(
+            f"site `{site}` has no value, and there is no random key to draw one: the draws do not hold the noise that "
+            f"drives `{name}`. Keep it in the run (no `~z.{site}` in `extra_fields`; `keep_noise` of "
+            "`run_checkpointed`), or integrate it out, `numpyro_bridges.estimate_evidence` of each datum's bridge."
+        ) from e
     law = law.given(noise)
-    seen = law.shape() if obs is None else np.shape(obs)
+    plates = next(iter(own.values()))["cond_indep_stack"]
+    drawn, sizes = _drawn_inside(plates)
+    law.refuse_hidden_axes(sizes, drawn)
+    if obs is not None:
+        obs = as_datum(obs, f"obs` of site `{name}")
+    seen = law.shape() if obs is None else obs.shape
     require(
         seen == law.shape(),
         f"site `{name}`: `obs` must have shape {law.shape()}, plates in front; got {seen}. Several data need a plate.",
     )
-    return law
+    return law, obs
+
+
+def _drawn_inside(plates) -> tuple[str, tuple[int, ...]]:
+    """A site that is drawn inside some of these plates, and the sizes of those plates."""
+    drawn, sizes = "", set()
+    for handler in _PYRO_STACK:
+        for name, site in handler.trace.items() if isinstance(handler, handlers.trace) else ():
+            noise = site["type"] == "sample" and isinstance(site["fn"], (AbstractNoiseDriven, DrivingNoise))
+            inside = set(site.get("cond_indep_stack", ())) & set(plates)
+            if site["type"] in ("sample", "param") and not noise and inside:
+                drawn = name
+                sizes |= {plate.size for plate in inside}
+    return drawn, tuple(sizes)

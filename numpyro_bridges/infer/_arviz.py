@@ -58,7 +58,7 @@ def to_arviz(
       `pcn_acceptance_rate`, numbered where blocks share it, `nuts0_lp`; a draw is `diverging` if any block was.
     - `posterior_paths`: for each observed `DiffusionEndpoint` the bridges, with axes `chain`, `draw`, the plates,
       `time`, `point` (unless states are vectors) and `coordinate`. An axis in which sites differ has the site's name in
-      front, `wing_time`. Times that vary with the draws are a variable, `wing_times`.
+      front, `wing_time`. Times that vary with the draws or the data are a variable, `wing_times`.
 
     A `/` in a name, as `handlers.scope` makes them, becomes a `.`: in a `DataTree` and in a NetCDF file it would be a
     group. `dims` and `coords` may be given with either.
@@ -88,7 +88,7 @@ def to_arviz(
         return {name: law.log_prob(value) for name, (law, value) in replay(values, names).items()}
 
     def bridges(values, names):
-        return {name: (law.path(value), law.parts["ts"]) for name, (law, value) in replay(values, names).items()}
+        return {name: (law.path(value), law.times) for name, (law, value) in replay(values, names).items()}
 
     def visible(draws):
         return {name: value for name, value in draws.items() if name not in hidden}
@@ -270,7 +270,8 @@ def _labelled(found, leading, kept, coords):
         if isinstance(grids[name]["time"], tuple):
             labels[axes[0]] = times[0, 0]
         else:
-            variables[f"{name}_times"] = (["chain", "draw", axes[0]], times)
+            own = leading[name] if times.ndim > 3 else ()
+            variables[f"{name}_times"] = (["chain", "draw", *own, axes[0]], times)
     return _dataset(variables, coords).assign_coords(labels)
 
 
@@ -286,7 +287,7 @@ def _dataset(variables, coords):
 def _grid(path, times, number) -> dict:
     """What two sites with a common axis agree in: its length, and the times if they do not vary with the draws."""
     axes = ("time", "point", "coordinate") if path.ndim - number == 3 else ("time", "coordinate")
-    fixed = {"time": tuple(times[0, 0])} if np.all(times == times[0, 0]) else {}
+    fixed = {"time": tuple(times[0, 0])} if times.ndim == 3 and np.all(times == times[0, 0]) else {}
     return dict(zip(axes, path.shape[number:], strict=True)) | fixed
 
 

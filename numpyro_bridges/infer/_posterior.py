@@ -72,6 +72,8 @@ class _Split(Messenger):
         fn, log_prob = msg["fn"], None
         if msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
             log_prob = fn.log_prob(msg["value"])
+            if msg.get("_control_flow_done"):  # in a scan a noise may reach later data: one energy for all
+                log_prob = jnp.sum(log_prob)
             self.log_likelihood[msg["name"]] = log_prob if msg["scale"] is None else msg["scale"] * log_prob
         if is_noise(msg) and msg["scale"] is not None:
             msg["scale"] = msg["scale"] - 1
