@@ -239,7 +239,8 @@ def in_a_plate(build, size=3, **site):
         return nb.sample("wing", law, obs=np.zeros((size, *law.event_shape)))
 
 
-def law_of(sde=SDE, x0=np.zeros(2), match=SEEN, **kwargs):
+def law_of(sde=SDE, x0=None, match=SEEN, **kwargs):
+    x0 = np.zeros(2) if x0 is None else x0
     kwargs = {"t1": 1.0, "num_steps": 5} | kwargs if "ts" not in kwargs else kwargs
     return nb.DiffusionEndpoint(sde, x0, match, **kwargs)
 
@@ -276,7 +277,10 @@ HIDDEN = {
     "variance": ("match", lambda own: law_of(match=nb.InexactMatch(own), x0=np.zeros(3))),
     "operator": ("match", lambda own: law_of(match=nb.InexactMatch(SPREAD, own[None]), x0=np.zeros(3))),
     "cuts": ("match", lambda own: law_of(match=nb.IntervalCensored(jnp.cumsum(own)))),
-    "guide": ("guide", lambda own: law_of(guide=nb.FrozenGuide(nb.LinearSDE(-jnp.diag(own)[:2, :2], own[:2, None] * own)))),
+    "guide": (
+        "guide",
+        lambda own: law_of(guide=nb.FrozenGuide(nb.LinearSDE(-1.0, own[:2, None] * own))),
+    ),
     "ts": ("ts", lambda own: law_of(ts=jnp.cumsum(own))),
     "t1": ("t1", lambda own: law_of(t1=own)),
     "t0": ("t0", lambda own: law_of(t0=-own)),

@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .._checks import floating, require, words
+from ..conditioning import IntervalCensored
 from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE
 from ..spaces import AbstractSpace
@@ -110,12 +111,16 @@ def stacked(part, axes, inner, own):
     return jax.tree.map(widened, part)
 
 
-def parameters(part, with_spaces=False):
-    """Arrays that may be parameters. Those of a guide only lead the path, and may be of any shape but for an SDE's."""
+def parameters(part, every=False):
+    """Arrays that may be parameters; `every`: those of a space and of cut points, which are vectors always, too.
+
+    A guide only leads the path, and its arrays may be of any shape but for those of an SDE.
+    """
     if isinstance(part, AbstractGuide):
         nodes = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, AbstractSDE))
-        return [leaf for node in nodes if isinstance(node, AbstractSDE) for leaf in parameters(node, with_spaces)]
-    leaves = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, AbstractSpace) and not with_spaces)
+        return [leaf for node in nodes if isinstance(node, AbstractSDE) for leaf in parameters(node, every)]
+    vectors = () if every else (AbstractSpace, IntervalCensored)
+    leaves = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, vectors))
     return [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
 
 

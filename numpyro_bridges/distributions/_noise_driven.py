@@ -236,7 +236,7 @@ class AbstractNoiseDriven(dist.Distribution):
         sizes = set(batch) - {1}
         for name in self.parts if names is None else names:
             part = None if name in self._batched + self._plain else self.parts.get(name)
-            for leaf in parameters(part, with_spaces=names is None):
+            for leaf in parameters(part, every=names is None):
                 require(
                     sizes.isdisjoint(leaf.shape),
                     f"`{name}` holds an array of shape {leaf.shape} and is used in a batch {tuple(batch)}"
