@@ -13,6 +13,7 @@ from numpyro.diagnostics import effective_sample_size
 from numpyro.infer import MCMC, NUTS, SVI, Predictive, Trace_ELBO, log_likelihood
 from numpyro.infer.autoguide import AutoDelta, AutoNormal
 from numpyro.infer.util import log_density
+from numpyro.primitives import Messenger
 
 import numpyro_bridges as nb
 from numpyro_bridges.infer._posterior import driven_by, split
@@ -158,6 +159,29 @@ def test_condition_do_substitute_and_block():
     assert set(trace_of(handlers.block(model, hide=["wing_noise"]), DATA)) == {"mean", "specimens", "wing"}
 
 
+def lifted(data):
+    mean = numpyro.param("mean", 0.3)
+    with numpyro.plate("specimens", N):
+        nb.sample("wing", law(mean), obs=data)
+
+
+HANDLED = {
+    "replay": lambda: handlers.replay(model, trace_of(handlers.substitute(model, PARAMS), DATA)),
+    "condition": lambda: handlers.condition(model, {"wing_noise": NOISE}),
+    "lift": lambda: handlers.lift(lifted, prior={"mean": dist.Normal(0.0, 2.0)}),
+    "scope": lambda: handlers.scope(model, prefix="moth", divider="_"),
+}
+
+
+@pytest.mark.parametrize("name", HANDLED)
+def test_handlers_keep_the_density(name):
+    prefix = "moth_" if name == "scope" else ""
+    params = {prefix + name: value for name, value in PARAMS.items()}
+    expected, _ = log_density(model, (DATA,), {}, PARAMS)
+    found, _ = log_density(HANDLED[name](), (DATA,), {}, params)
+    assert float(found) == pytest.approx(float(expected), abs=1e-10)
+
+
 def test_own_parameters_of_each_specimen():
     """A parameter inside the plate: one SDE per specimen, declared."""
 
@@ -192,6 +216,29 @@ def test_data_of_other_kinds():
         np.testing.assert_array_equal(found["value"], expected)
         assert found["value"].dtype == np.float32 or found["value"].dtype == float
         assert found["fn"].log_prob(found["value"]).shape == (N,)
+
+
+def classes(data):
+    """A class of each specimen, summed over: all classes share the specimen's noise."""
+    share = numpyro.sample("share", dist.Beta(2.0, 2.0))
+    laws = [law(mean) for mean in (-0.5, 1.0)]
+    with numpyro.plate("specimens", N):
+        noise = numpyro.sample("wing_noise", laws[0].noise_prior(), infer={"driving_noise": True})
+        shares = dist.CategoricalProbs(jnp.stack([share, 1 - share]))
+        mixed = dist.MixtureGeneral(shares, [one.given(noise) for one in laws])
+        numpyro.sample("wing", mixed, obs=data)
+
+
+def test_classes_are_summed_over():
+    params = {"share": 0.3, "wing_noise": NOISE}
+    found, trace = log_density(classes, (DATA,), {}, params)
+    first, second = (law(mean).expand((N,)).given(NOISE).log_prob(DATA) for mean in (-0.5, 1.0))
+    expected = np.logaddexp(np.log(0.3) + first, np.log(0.7) + second)
+    np.testing.assert_allclose(trace["wing"]["fn"].log_prob(DATA), expected, atol=1e-8)
+    prior = dist.Beta(2.0, 2.0).log_prob(0.3)
+    assert float(found) == pytest.approx(float(prior + priors()[1].sum() + expected.sum()), abs=1e-6)
+    rest, weights = split(classes, (DATA,), {}, {"share": jnp.log(0.3 / 0.7), "wing_noise": jnp.asarray(NOISE)})
+    assert weights == {} and float(rest) == pytest.approx(-float(prior + expected.sum() + np.log(0.21)), abs=1e-6)
 
 
 def chain(ys):
@@ -333,6 +380,34 @@ def test_noise_that_was_dropped():
         log_likelihood(model, {"mean": jnp.zeros(4)}, DATA)
     with pytest.raises(ValueError, match=message):
         log_density(model, (DATA,), {}, {"mean": 0.0})
+
+
+@pytest.mark.parametrize("number", [1, N - 1])
+def test_noise_of_other_data(number):
+    draws = {"mean": np.zeros(4), "wing_noise": np.zeros((4, *NOISE.shape))}
+    message = f"`wing_noise` has a value for {N} data.*`specimens` has {number}.*leave it out"
+    with pytest.raises(ValueError, match=message):
+        Predictive(model, draws)(jr.key(0), n=number)
+
+
+def test_an_enumerated_class():
+    """funsor, which enumerates, may not be installed: its handler is known by its name."""
+    enumeration = type("enum", (Messenger,), {"__module__": "numpyro.contrib.funsor.enum_messenger"})
+
+    def enumerated():
+        means = jnp.array([0.0, 1.0])[:, None]  # of two classes, in front of the plate
+        sde = jax.vmap(jax.vmap(lambda mean: nb.LinearSDE(-RATE, SIGMA, mean)))(means)
+        with numpyro.plate("specimens", N):
+            nb.sample("wing", law_of(sde, batch_shape=(2, 1)))
+
+    def other():
+        with numpyro.plate("specimens", N):
+            nb.sample("wing", law(0.3), obs=DATA)
+
+    with enumeration(), pytest.raises(ValueError, match="site `wing`.*enumerated.*MixtureGeneral.*given"):
+        trace_of(enumerated)
+    with enumeration():
+        assert trace_of(other)["wing"]["value"].shape == (N, 2)
 
 
 def test_data_of_no_kind():

@@ -58,8 +58,22 @@ def _with_noise(name, law, obs):
             f"drives `{name}`. Keep it in the run (no `~z.{site}` in `extra_fields`; `keep_noise` of "
             "`run_checkpointed`), or integrate it out, `numpyro_bridges.estimate_evidence` of each datum's bridge."
         ) from e
-    law = law.given(noise)
     plates = next(iter(own.values()))["cond_indep_stack"]
+    outermost = max((-plate.dim for plate in plates), default=0)
+    require(
+        len(law.batch_shape) <= outermost or not any(map(_enumerates, _PYRO_STACK)),
+        f"site `{name}`: the law depends on a discrete site that is enumerated, and its noise cannot be: all classes "
+        "share it. Sum over the classes of a bound law instead, `MixtureGeneral(Categorical(p), [law.given(noise) for "
+        "law in laws])` with `noise` drawn from one `law.noise_prior()`, or draw the class in a block of `Gibbs`.",
+    )
+    law = law.given(noise)
+    for plate in plates:
+        size = law.batch_shape[plate.dim] if len(law.batch_shape) >= -plate.dim else 1
+        require(
+            size == plate.size,
+            f"site `{site}` has a value for {size} data, and the plate `{plate.name}` has {plate.size}: noise belongs "
+            "to the data that were seen. For new data leave it out of the draws that `Predictive` is given.",
+        )
     drawn, sizes = _drawn_inside(plates)
     law.refuse_hidden_axes(sizes, drawn)
     if obs is not None:
@@ -70,6 +84,11 @@ def _with_noise(name, law, obs):
         f"site `{name}`: `obs` must have shape {law.shape()}, plates in front; got {seen}. Several data need a plate.",
     )
     return law, obs
+
+
+def _enumerates(handler) -> bool:
+    """Whether a handler is NumPyro's enumeration, which is imported only where funsor is installed."""
+    return type(handler).__module__.startswith("numpyro.contrib.funsor") and type(handler).__name__ == "enum"
 
 
 def _drawn_inside(plates) -> tuple[str, tuple[int, ...]]:
