@@ -8,7 +8,7 @@ import datetime
 import math
 import operator
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, NoReturn
@@ -138,7 +138,7 @@ def _kind(x: Any) -> str | None:
             return kind
     if isinstance(x, (int, float)):
         return None
-    if np.ma.is_masked(x):
+    if isinstance(x, np.ma.MaskedArray) and np.ma.is_masked(x):
         return "masked"
     if not isinstance(x, (jax.Array, np.ndarray, np.generic)):
         try:
@@ -233,8 +233,8 @@ def as_path(value: Any, name: str) -> Path:
     return Path(value)
 
 
-def require_key(key: Any, name: str = "key") -> None:
-    """One random key, `jax.random.key(0)` or the raw `jax.random.PRNGKey(0)`."""
+def require_key(key: Any, name: str = "key", several: bool = False) -> None:
+    """One random key, `jax.random.key(0)` or the raw `jax.random.PRNGKey(0)`, or `several` in one array."""
     message = f"`{name}` must be a random key, such as `jax.random.key(0)`; got {words(key)}."
     require(isinstance(key, (jax.Array, np.ndarray)), message)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
@@ -242,9 +242,15 @@ def require_key(key: Any, name: str = "key") -> None:
         raw = jax.eval_shape(jax.random.PRNGKey, 0)
         require(key.dtype == raw.dtype and key.shape[-1:] == raw.shape, message)
     require(
-        key.ndim == (0 if typed else 1),
+        key.ndim - (not typed) in ((0, 1) if several else (0,)),
         f"`{name}` must be one random key; got {words(key)}, several. Use vmap over them, or one of them, `keys[0]`.",
     )
+
+
+def require_mapping(value: Any, name: str) -> None:
+    """Something by name; `None` is nothing."""
+    good = value is None or (isinstance(value, Mapping) and all(isinstance(key, str) for key in value))
+    require(good, f"`{name}` must be a dictionary by name, or None; got {words(value)}.")
 
 
 def require_instance(value: Any, kind: type | tuple[type, ...], name: str, cure: str) -> None:

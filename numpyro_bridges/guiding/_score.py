@@ -66,6 +66,12 @@ class Standard(eqx.Module):
         return (v - centre) / self.spread
 
 
+def _context(function: Any) -> Any:
+    good = function is None or callable(function)
+    require(good, f"`context` must be a function of the SDE, or None; got {words(function)}.")
+    return function
+
+
 class ScoreGuide(AbstractGuide):
     """Another guide, corrected by a network. `numpyro_bridges.scores.fit` trains one.
 
@@ -86,7 +92,7 @@ class ScoreGuide(AbstractGuide):
     guide: AbstractGuide
     network: Callable
     standard: Standard
-    context: Context | None = eqx.field(static=True, default=None)
+    context: Context | None = eqx.field(static=True, default=None, converter=_context)
     history: dict[str, Array] = eqx.field(default_factory=dict)
     held: Callable | None = None
 
@@ -94,9 +100,8 @@ class ScoreGuide(AbstractGuide):
         require_instance(self.guide, AbstractGuide, "guide", "a guide, such as `RecedingGuide()`")
         require(callable(self.network), f"`network` must be a function (t, x, v, theta); got {words(self.network)}.")
         require_instance(self.standard, Standard, "standard", "a `Standard`, which `numpyro_bridges.scores.fit` makes")
-        for name, function in (("context", self.context), ("held", self.held)):
-            good = function is None or callable(function)
-            require(good, f"`{name}` must be a function, or None; got {words(function)}.")
+        good = self.held is None or callable(self.held)
+        require(good, f"`held` must be a network, or None; got {words(self.held)}.")
         require_instance(self.history, Mapping, "history", "a dictionary of arrays")
 
     def check(self, sde, x):

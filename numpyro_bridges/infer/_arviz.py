@@ -16,7 +16,7 @@ from numpyro.distributions import ExpandedDistribution, Independent, MaskedDistr
 from numpyro.infer import MCMC
 from numpyro.ops.provenance import eval_provenance
 
-from .._checks import positive_integer, require
+from .._checks import flag, positive_integer, require, require_instance, require_mapping
 from ..distributions import AbstractNoiseDriven, DiffusionEndpoint
 from ._posterior import is_latent, is_noise, sites_of
 from ._statistics import statistics
@@ -66,6 +66,15 @@ def to_arviz(
     **Errors:** `ValueError` for a kernel without a model, for `paths` without such a site, or without its noise, for
     predictions that are not draws of this run, and for names that differ only in `/` and `.`.
     """
+    require_instance(mcmc, MCMC, "mcmc", "an `MCMC` of NumPyro")
+    for name, groups in (
+        ("prior", prior),
+        ("posterior_predictive", posterior_predictive),
+        ("coords", coords),
+        ("dims", dims),
+    ):
+        require_mapping(groups, name)
+    noise, paths = flag(noise, "noise"), None if paths is None else positive_integer(paths, "paths")
     model = getattr(mcmc.sampler, "model", None)
     require(callable(model), "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.")
     sites = sites_of(model, mcmc._args, mcmc._kwargs)
@@ -113,7 +122,7 @@ def to_arviz(
         axes = {name: _leading_axes(name, value.ndim - 2, dims) for name, value in found.items()}
         datasets["log_likelihood"] = _seen_only(found, seen, axes, coords)
     if paths is not None:
-        paths, (draws, driving) = positive_integer(paths, "paths"), _with_noise(mcmc)
+        draws, driving = _with_noise(mcmc)
         places = np.linspace(0, len(draws) - 1, min(paths, len(draws))).astype(int)
         kept = draws[places]
         driven = [name for name in observed if isinstance(sites[name]["fn"], DiffusionEndpoint)]

@@ -17,7 +17,6 @@ import json
 import sys
 import warnings
 from functools import partial
-from pathlib import Path
 from zipfile import BadZipFile
 
 import jax
@@ -29,7 +28,7 @@ from numpyro.infer import MCMC
 from numpyro.util import is_prng_key, nested_attrgetter
 from tqdm.auto import tqdm
 
-from .._checks import positive_integer, require
+from .._checks import as_path, positive_integer, require, require_instance, require_key, words
 from .._files import write_whole
 from ._posterior import noise_sites, sites_of
 
@@ -69,10 +68,14 @@ def run_checkpointed(
     A change of the model itself, or of what it takes from outside its arguments, shows only in how the chains start; it
     leads to a warning.
     """
+    require_instance(mcmc, MCMC, "mcmc", "an `MCMC` of NumPyro")
+    require_key(rng_key, "rng_key", several=mcmc.num_chains > 1)
+    good = isinstance(extra_fields, (tuple, list)) and all(isinstance(name, str) for name in extra_fields)
+    require(good, f"`extra_fields` must be names of fields; got {words(extra_fields)}.")
     interval = positive_integer(interval, "interval")
     keep_noise = None if keep_noise is None else positive_integer(keep_noise, "keep_noise")
     require(mcmc.post_warmup_state is None, "`mcmc` must do its own warm-up: set `mcmc.post_warmup_state` to None.")
-    folder = Path(path)
+    folder = as_path(path, "path")
     require(folder.is_dir() or not folder.exists(), f"`path` must be a directory, or a new name; {folder} is a file.")
     chains = _Chains(mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval)
     state, done = _load_state(folder, chains)

@@ -7,6 +7,8 @@ With θ the unconstrained parameters, z the driving noise and v_s the data that 
 `rest` holding priors of parameters, Jacobians, factors and data that no noise drives.
 """
 
+from collections.abc import Mapping
+
 import jax
 import jax.numpy as jnp
 import numpyro
@@ -17,6 +19,7 @@ from numpyro.infer import init_to_median, init_to_sample
 from numpyro.infer.util import potential_energy
 from numpyro.primitives import Messenger
 
+from .._checks import require_instance
 from ..distributions import AbstractNoiseDriven
 
 Sites = dict[str, Array]
@@ -46,6 +49,7 @@ def is_noise(site) -> bool:
 
 def noise_sites(trace) -> tuple[str, ...]:
     """Names of the driving noise in a trace: the block of `PCN` in `Gibbs([(PCN(model), noise_sites), ...])`."""
+    require_instance(trace, Mapping, "trace", "sites by name, of `numpyro.handlers.trace(model).get_trace(...)`")
     return tuple(name for name, site in trace.items() if is_noise(site) and not site["is_observed"])
 
 

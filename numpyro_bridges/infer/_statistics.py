@@ -4,7 +4,9 @@ from typing import Any
 
 import numpy as np
 from numpyro.infer import HMC, NUTS, Gibbs
+from numpyro.infer.mcmc import MCMCKernel
 
+from .._checks import require_instance
 from ._hmc import FunctionSpaceHMC
 from ._pcn import AbstractPCN
 from ._pseudo_marginal import AbstractPseudoMarginal
@@ -33,6 +35,7 @@ def fields(kernel) -> tuple[str, ...]:
 
     **Returns:** names of fields of the kernel's state; of any other kernel, those that NumPyro collects by default.
     """
+    require_instance(kernel, MCMCKernel, "kernel", "a kernel of MCMC, such as `NUTS(model)`")
     return tuple(path + name for block, path, _ in _blocks(kernel) for name in _fields_of(block))
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import known_float, known_number, require, words
+from .._checks import known_float, known_number, require, require_mapping, words
 from ._canvas import ACCENT, START, TARGET, pyplot
 
 
@@ -33,11 +33,9 @@ def posterior(
 
     **Returns:** the list of filled areas, one for each parameter in order.
     """
-    for name, given in (("samples", samples), ("prior", prior or {}), ("truth", truth or {})):
-        require(
-            isinstance(given, Mapping) and all(isinstance(key, str) for key in given),
-            f"`{name}` must be a dictionary of draws or values by name; got {words(given)}.",
-        )
+    require(samples is not None, "`samples` must be a dictionary of draws by name; got None.")
+    for name, given in (("samples", samples), ("prior", prior), ("truth", truth)):
+        require_mapping(given, name)
     level = known_number(level, "level", "a probability in (0, 1)", lambda value: 0 < value < 1)
     draws = {}
     for name, value in samples.items():
