@@ -7,6 +7,7 @@ scalar or diagonal problem compiles to elementwise work.
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -24,6 +25,30 @@ def full_precision(f):
             return f(*args, **kwargs)
 
     return wrapped
+
+
+def varying_like(carry, *inputs):
+    """The first carry of a loop that computes with `inputs`, typed as what it becomes.
+
+    Inside `jax.shard_map` a constant is the same on every device and the loop's result is not: JAX
+    wants that said of the carry beforehand. Elsewhere nothing is done.
+    """
+    axes = frozenset().union(*(_varying_axes(leaf) for leaf in jax.tree.leaves(inputs)))
+
+    def mark(leaf):
+        missing = tuple(sorted(axes - _varying_axes(leaf)))
+        return _mark_varying(leaf, missing) if missing else leaf
+
+    return jax.tree.map(mark, carry)
+
+
+def _varying_axes(leaf) -> frozenset:
+    """Mesh axes along which a value differs from device to device."""
+    return getattr(jax.typeof(leaf), "vma", frozenset()) if eqx.is_array(leaf) else frozenset()
+
+
+def _mark_varying(leaf, axes):
+    return lax.pcast(leaf, axes, to="varying") if hasattr(lax, "pcast") else lax.pvary(leaf, axes)
 
 
 def _rows(d, x):

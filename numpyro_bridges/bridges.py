@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._checks import as_float, concrete, require, require_finite, require_instance
-from ._linalg import apply, congruence, full_precision, promote
+from ._linalg import apply, congruence, full_precision, promote, varying_like
 from ._types import RealScalar, State
 from .conditioning import AbstractCondition, GaussianMessage, Observation, Target
 from .guiding import (
@@ -218,7 +218,8 @@ class GuidedBridge(eqx.Module):
             return x + (times[1] - times[0]) * self.sde.drift(times[0], x), None
 
         if seen.operator.ndim or self.condition.num_extra_noises:  # part of the end state is open
-            free, _ = jax.lax.scan(drift_step, free, (self.ts[:-1], self.ts[1:]))
+            start = varying_like(free, self.sde, self.ts)
+            free, _ = jax.lax.scan(drift_step, start, (self.ts[:-1], self.ts[1:]))
         reference = self.condition.reference(self.sde, free)
         return seen, reference
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from .._checks import as_float, concrete, require, require_finite
-from .._linalg import promote
+from .._linalg import promote, varying_like
 from .._types import State, Structured
 from ..sdes import AbstractSDE
 from ._base import AbstractCondition, AbstractMatch, Observation, Target, lift
@@ -112,7 +112,8 @@ class CylinderSet(AbstractCondition):
             w_i, log_weight = one(lower[i], upper[i], mean[i] + factor[i] @ w, driver[i], factor[i, i])
             return w.at[i].set(w_i), log_weight
 
-        return jax.lax.scan(step, jnp.zeros_like(mean), jnp.arange(m))
+        start = varying_like(jnp.zeros_like(mean), mean, factor, driver, lower, upper)
+        return jax.lax.scan(step, start, jnp.arange(m))
 
     def log_value(self, law_mean, law_factor):
         """In product form: coordinates independent given the state."""

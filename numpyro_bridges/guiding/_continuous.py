@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import add, apply, cholesky, columns, congruence, promote, solve_lower
+from .._linalg import add, apply, cholesky, columns, congruence, promote, solve_lower, varying_like
 from .._types import RealScalar, State
 from ..conditioning import GaussianMessage, Observation
 from ..sdes import AbstractSDE, LinearSDE
@@ -107,6 +107,7 @@ def travel_continuous(
 
     free = ts.shape[0] - 2 if seen.exact else ts.shape[0] - 1
     start = (x0, exact_message(auxiliary, seen, ts[0], t_end, x0, observed).log_value(x0))
+    start = varying_like(start, sde, auxiliary, seen, ts, noise, observed)
     (x, log_weight), path = jax.lax.scan(step, start, (ts[:free], ts[1 : free + 1], noise[:free]))
     if seen.exact:
         message = exact_message(auxiliary, seen, ts[-2], t_end, x, observed)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._linalg import apply
+from .._linalg import apply, varying_like
 from .._types import Noise, State
 from ..conditioning import Observation
 from ..sdes import AbstractSDE, Transition
@@ -45,6 +45,7 @@ def travel(
         return y, y[0]
 
     start = (x0, jnp.zeros((), x0.dtype))
+    start = varying_like(start, sde, plan, ts, noise, observed)
     (x, log_weight), path = jax.lax.scan(step, start, (ts[:-2], ts[1:-1], noise, _ends(plan)))
     return path, x, log_weight
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from .._checks import as_float, require, require_instance
-from .._linalg import add, apply, cholesky, compose, congruence, promote
+from .._linalg import add, apply, cholesky, compose, congruence, promote, varying_like
 from .._types import RealScalar, State, Structured
 from ..conditioning import GaussianMessage, Observation
 from ..sdes import AbstractSDE, AffineStep, BrownianMotion, LinearSDE, Transition
@@ -179,6 +179,7 @@ class RecedingGuide(AbstractGuide):
 
         one = promote(jnp.ones((), reference.dtype), ndim, n)
         start = (one, jnp.zeros_like(apply(seen.operator, reference)), jnp.zeros_like(_square(one)))
+        start = varying_like(start, seen, operator, shift, ts)
         _, planned = jax.lax.scan(back, start, (operator, shift, jnp.diff(ts)), reverse=True)
         return _RecedingPlan(
             planned, seen.operator, seen.covariance, sde.covariance(ts[-1], reference), self.end_weight
@@ -244,7 +245,7 @@ def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, S
     shapes = jax.eval_shape(lambda s: back(s, first)[0], shapes)
     operator = promote(seen.operator, len(shapes[0].shape), n)
     carry = (operator, start[1], promote(seen.covariance, len(shapes[2].shape), start[1].shape[0]))
-    return jax.lax.scan(back, carry, steps, reverse=True)[1]
+    return jax.lax.scan(back, varying_like(carry, seen, steps), steps, reverse=True)[1]
 
 
 def _square(flow: Structured) -> Structured:

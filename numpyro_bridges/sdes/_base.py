@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import floating, require
-from .._linalg import add, apply, columns, full_precision, promote
+from .._linalg import add, apply, columns, full_precision, promote, varying_like
 from .._types import Noise, RealScalar, State, Structured
 from ..spaces import AbstractSpace
 
@@ -180,7 +180,8 @@ def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
         x = law.mean + apply(law.factor, z.reshape(z.shape[: x.ndim]))
         return x, x
 
-    _, path = jax.lax.scan(step, x0, (ts[:-1], ts[1:], noise))
+    start = varying_like(x0, sde, ts, noise)
+    _, path = jax.lax.scan(step, start, (ts[:-1], ts[1:], noise))
     return jnp.concatenate([x0[None], path])
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._checks import as_float, concrete, require, require_finite
-from .._linalg import apply, cholesky, compose, congruence, promote, symmetric, transpose
+from .._linalg import apply, cholesky, compose, congruence, promote, symmetric, transpose, varying_like
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
 from ._base import AbstractSDE, AffineStep, Transition, as_state_shift
@@ -56,6 +56,7 @@ def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array
 
     identity = jnp.eye(B.shape[0], dtype=B.dtype)
     start = (identity, beta, a, (jnp.zeros_like(B), beta, a))
+    start = varying_like(start, B, beta, a, dt)
     (*_, totals), _ = jax.lax.scan(series, start, jnp.arange(1, _TERMS + 1, dtype=B.dtype))
 
     def double(totals, i):
