@@ -52,11 +52,7 @@ def rms_radius(points: ArrayLike) -> NDArray:
 
 def unit_size(points: ArrayLike) -> NDArray:
     """Shapes (..., n, d) centred and divided by their RMS radius."""
-    points = center(points)
-    size = rms_radius(points)
-    if not np.all(size > 0.0):
-        raise ValueError("`points` must not all coincide: a shape without extent has no unit size.")
-    return points / size[..., None, None]
+    return _unit_size(center(points), "points")
 
 
 class Alignment(NamedTuple):
@@ -122,25 +118,26 @@ def procrustes_align(
         raise ValueError(
             f"`shapes[{worst}]` must have at least {dim} seen points, got {num_seen[worst]}: leave it out."
         )
-    standard = unit_size if scale else center
+    def standard(points: NDArray, name: str) -> NDArray:
+        return _unit_size(center(points), name) if scale else center(points)
 
     if reference is None:
         complete = np.flatnonzero(~np.any(missing, axis=1))
         if complete.size == 0:
             raise ValueError("`shapes` must have one without missing points, or give a `reference`.")
         first = complete[0]
-        mean = standard(shapes[first])
+        mean = standard(shapes[first], f"shapes[{first}]")
     else:
-        mean = standard(_shape(reference, "reference"))
+        mean = standard(_shape(reference, "reference"), "reference")
         if mean.shape != (num_points, dim):
             raise ValueError(f"`reference` must have the shape {(num_points, dim)}, got {mean.shape}.")
 
     converged, iteration = False, 0
     while not converged and iteration < max_iterations:
         iteration += 1
-        filled = standard(_fill(shapes, missing, mean))
+        filled = standard(_fill(shapes, missing, mean), "shapes")
         aligned = filled @ _rotations(filled, mean)
-        previous, mean = mean, standard(aligned.mean(axis=0))
+        previous, mean = mean, standard(aligned.mean(axis=0), "shapes")
         change = np.sqrt(np.mean(np.sum((mean - previous) ** 2, axis=-1)))
         converged = reference is not None or bool(change <= tolerance * rms_radius(mean))
 
@@ -211,6 +208,14 @@ def _shape(points: ArrayLike, name: str) -> NDArray:
     if points.ndim != 2 or points.shape[-1] not in (2, 3) or len(points) == 0:
         raise ValueError(f"`{name}` must have the shape (n, 2) or (n, 3), got {points.shape}.")
     return _seen(points, name)
+
+
+def _unit_size(points: NDArray, name: str) -> NDArray:
+    """Centred shapes divided by their RMS radius."""
+    size = rms_radius(points)
+    if not np.all(size > 0.0):
+        raise ValueError(f"`{name}` must not all coincide: a shape without extent has no unit size.")
+    return points / size[..., None, None]
 
 
 def _shapes(points: ArrayLike, name: str) -> NDArray:

@@ -105,7 +105,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         """
         require(self.noise is not None, "`path` needs the noise: use `law.given(noise)`.")
         observed = as_datum(observed, "observed")
-        self._check_value(observed)
+        self._check_value(observed, "observed")
         observed = jnp.broadcast_to(observed, self.shape())
         path = self._over_batch(_path, self._full_shape, observed, self.noise)
         if self._mask is None:

@@ -151,7 +151,7 @@ class AbstractNoiseDriven(dist.Distribution):
         It is no density of `value` at fixed noise. Where the law is masked it is 0, whatever the value, NaN included.
         """
         value = as_datum(value, "value")
-        self._check_value(value)
+        self._check_value(value, "value")
         require(
             self.noise is not None,
             f"the noise site is missing: {type(self).__name__} has a density only with its noise bound. Use "
@@ -256,16 +256,17 @@ class AbstractNoiseDriven(dist.Distribution):
         shared = {name: part for name, part in self.parts.items() if name not in own}
         return map_batch(one, shared, own, self._own_shape, batch_shape, arrays)
 
-    def _check_value(self, value):
+    def _check_value(self, value, name):
         shape = jnp.shape(value)
         k = len(shape) - self.event_dim
         require(
             k >= 0 and shape[k:] == self.event_shape,
-            f"an observation must have shape {self.event_shape}, behind a batch {self.batch_shape}; got {shape}.",
+            f"`{name}`, an observation, must have shape {self.event_shape}, behind a batch {self.batch_shape}; got "
+            f"{shape}.",
         )
         require(
             broadcasts(shape[:k], self.batch_shape),
-            f"{math.prod(shape[:k])} observations, batch shape {shape[:k]}, for a law of batch {self.batch_shape}. "
+            f"`{name}` holds {math.prod(shape[:k])} observations, batch shape {shape[:k]}, for a law of batch {self.batch_shape}. "
             "One noise shared by several data is a wrong likelihood: put the site into a `numpyro.plate`.",
         )
         data, mask = concrete(value), True if self._mask is None else concrete(self._mask)
@@ -290,7 +291,7 @@ class AbstractNoiseDriven(dist.Distribution):
                 raise ValueError(f"datum {tuple(map(int, index))}: {e}" if index else str(e)) from e
 
     def _validate_sample(self, value):
-        self._check_value(value)
+        self._check_value(value, "value")
         return jnp.ones((), bool)
 
 

@@ -91,7 +91,7 @@ def as_specimens(specimens: Iterable[Specimen]) -> list[Specimen]:
     specimens = list(specimens)
     for i, specimen in enumerate(specimens):
         require_instance(specimen, Specimen, f"specimens[{i}]", "a `Specimen`")
-    require(bool(specimens), "`specimens` must hold at least one specimen, got none.")
+    require(len(specimens) > 0, "`specimens` must hold at least one specimen, got none.")
     return specimens
 
 

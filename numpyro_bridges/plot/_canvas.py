@@ -30,7 +30,9 @@ def shape_axes(ax: Any, points: NDArray, size: float = 5.0) -> Any:
     )
     if ax is None:
         extent = np.ptp(seen(points), axis=0)
-        figsize = size * np.maximum(extent / extent.max(), 0.05) + 0.3
+        longest = extent.max()
+        proportions = extent / longest if 0 < longest < np.inf else np.ones(2)
+        figsize = size * np.maximum(proportions, 0.05) + 0.3
         _, ax = plt.subplots(figsize=tuple(figsize), layout="constrained")
         ax.set_axis_off()
     ax.set_aspect("equal")

@@ -92,6 +92,7 @@ class SpectralNoise(AbstractNoise):
         self.period = None if period is None else as_float(period, "period")
         self.diameter = as_float(diameter, "diameter")
         require_positive(self.diameter, "diameter", "Give the largest distance of two points that is expected.")
+        require(self.diameter.ndim == 0, f"`diameter` must be one number; got shape {self.diameter.shape}.")
         if self.period is not None:
             require_positive(self.period, "period", "Give the side of a box that the shapes stay well inside.")
             require(self.period.ndim == 0, f"`period` must be one number for all axes; got shape {self.period.shape}.")
@@ -152,6 +153,12 @@ class GridNoise(AbstractNoise):
         self.lower, self.upper = as_float(lower, "lower"), as_float(upper, "upper")
         require_finite(self.lower, "lower")
         require_finite(self.upper, "upper")
+        shapes = {self.lower.shape, self.upper.shape} - {()}
+        require(
+            len(shapes) < 2 and all(len(shape) == 1 for shape in shapes),
+            f"`lower` and `upper` must be numbers or corners (dim,) of a box; got shapes {self.lower.shape} and "
+            f"{self.upper.shape}.",
+        )
         require(jnp.all(self.lower < self.upper), f"`lower` must be below `upper`; got {lower} and {upper}.")
         self.num_cells = positive_integer(num_cells, "num_cells")
 
