@@ -85,6 +85,16 @@ def floating(x: Any, name: str) -> jax.Array:
     return jnp.asarray(x) if keeps else _converted(x, jnp.result_type(float), name)
 
 
+def known(x: Any, name: str) -> np.ndarray | None:
+    """The value in double precision as the user gave it, or None where it is traced.
+
+    A constant is known inside a traced function too, but no more once it is a JAX array there: what a value decides is
+    decided by this, so that it does not depend on where an object is built.
+    """
+    x = _real(x, name)
+    return None if isinstance(x, Tracer) else np.asarray(x, float)
+
+
 def known_float(x: Any, name: str) -> np.ndarray:
     """A NumPy array of double precision, for what is prepared outside traced programs."""
     x = _real(x, name)
@@ -258,7 +268,7 @@ def require_instance(value: Any, kind: type | tuple[type, ...], name: str, cure:
     require(isinstance(value, kind), f"`{name}` must be {cure}; got {words(value)}.")
 
 
-def require_finite(x: jax.Array, name: str, cure: str = "") -> None:
+def require_finite(x: jax.Array | np.ndarray, name: str, cure: str = "") -> None:
     """Every entry is finite, where that can be known."""
     value = concrete(x)
     if value is not None and not np.all(np.isfinite(value)):

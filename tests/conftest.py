@@ -20,10 +20,22 @@ NUMPYRO = ("test_distributions", "test_infer", "test_examples", "test_readme")
 # Modules whose few tests take longest.
 LONG = ("test_examples", "test_docs", "test_kunita", "test_reference")
 
+# Modules that show soonest what another version of Python, JAX, NumPyro or ArviZ breaks, each of them quick.
+SHORT = ("test_arviz", "test_drive", "test_infer_parts", "test_layers", "test_sample", "test_weights")
+
 
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, which take minutes")
+    parser.addoption("--short", action="store_true", help=f"run {', '.join(SHORT)} alone")
     parser.addoption("--seed", type=int, help="seed of the `key` fixture; by default a new one for each test")
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Whether a path is left out; `None` leaves the decision to others."""
+    is_module = collection_path.name.startswith("test_") and collection_path.suffix == ".py"
+    if config.getoption("--short") and is_module and collection_path.stem not in SHORT:
+        return True
+    return None
 
 
 def pytest_collection_modifyitems(config, items):

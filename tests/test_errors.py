@@ -229,7 +229,7 @@ CONDITIONS = [
     ),
     (
         "mask-and-matrix",
-        lambda: bridge(OU, nb.InexactMatch(np.eye(3), mask=[1, 0, 1]).at(X)),
+        lambda: bridge(OU, nb.InexactMatch(np.eye(3), mask=[True, False, True]).at(X)),
         "`mask` must .*independent",
     ),
     ("datum-nan", lambda: NEAR.at(NAN), r"`observed` must be finite; entry \(0,\) is nan. .*`mask=`.*`operator=`"),

@@ -1,12 +1,18 @@
 """The MCMC kernels at their edges: settings, starts, what a model may not do, and new data for an old chain."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
-from numpyro.infer import MCMC, init_to_median
+from jax.example_libraries import stax
+from numpyro.contrib.control_flow import cond, scan
+from numpyro.contrib.module import random_eqx_module
+from numpyro.infer import MCMC, NUTS, Gibbs, init_to_median
+from numpyro.infer.util import potential_energy
 
 import numpyro_bridges as nb
 from numpyro_bridges.infer import (
@@ -16,7 +22,10 @@ from numpyro_bridges.infer import (
     CorrelatedPseudoMarginalMALA,
     FunctionSpaceHMC,
     _kernel,
+    noise_sites,
+    run_checkpointed,
 )
+from numpyro_bridges.infer._posterior import is_latent, misfit, sites_of
 from numpyro_bridges.infer._reference import Reference
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
@@ -114,3 +123,206 @@ def test_number_of_steps(settings, num_warmup, expected):
     assert set(found["num_steps"].tolist()) == expected
     np.testing.assert_allclose(found["num_steps"] * found["adapt_state.step_size"], 2.1)
     assert np.all(found["accept_prob"] > 0.1)
+
+
+def subset(data):
+    mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
+    with numpyro.plate("specimen", len(data), subsample_size=1) as index:
+        nb.sample("wing", law_of(mean), obs=jnp.asarray(data)[index])
+
+
+def with_factor(draw):
+    """The model with a factor that is drawn."""
+
+    def model_with_factor(data):
+        model(data)
+        numpyro.factor("more", draw())
+
+    return model_with_factor
+
+
+def in_scan(draw):
+    def drawn():
+        return scan(lambda total, _: (total + draw(), None), 0.0, None, length=3)[0]
+
+    return with_factor(drawn)
+
+
+def draw_from_key():
+    return jr.normal(numpyro.prng_key())
+
+
+def draw_hidden():
+    with numpyro.handlers.block():
+        return numpyro.sample("hidden", dist.Normal())
+
+
+def draw_network():
+    network = numpyro.module("network", stax.Dense(1), (1,))
+    return network(jnp.ones(1))[0]
+
+
+def draw_subset():
+    with numpyro.plate("part", 5, subsample_size=2) as index:
+        return jnp.sum(index) * 1.0
+
+
+def draw_deterministic():
+    numpyro.deterministic("predicted", draw_from_key())
+    return 0.0
+
+
+def fixed(model):
+    return numpyro.handlers.condition(model, {"mean": 0.3})
+
+
+RANDOM = {
+    "subset": (subset, "plate `specimen` draws 1 of its 2 data at random"),
+    "subset, seeded": (numpyro.handlers.seed(subset, 1), "plate `specimen` draws 1 of its 2 data"),
+    "subset in a factor": (with_factor(draw_subset), "plate `part` draws 2 of its 5 data"),
+    "subset in scan": (in_scan(draw_subset), "the model needs a random key"),
+    "key": (with_factor(draw_from_key), "the model needs a random key"),
+    "key, seeded": (numpyro.handlers.seed(with_factor(draw_from_key), 1), "the model needs a random key"),
+    "key in scan": (in_scan(draw_from_key), "the model needs a random key"),
+    "key, of no weight": (with_factor(draw_deterministic), "the model needs a random key"),
+    "hidden site": (with_factor(draw_hidden), "the model needs a random key"),
+    "network": (with_factor(draw_network), "the model needs a random key"),
+}
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_hidden_randomness_is_refused(name):
+    model, message = RANDOM[name]
+    with pytest.raises(ValueError, match=message):
+        FunctionSpaceHMC(model).init(jr.key(0), 0, None, (DATA,), {})
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        lambda model: PCN(fixed(model)),
+        lambda model: PCNL(fixed(model)),
+        lambda model: CorrelatedPseudoMarginal(model),
+        lambda model: CorrelatedPseudoMarginalMALA(model, 2),
+        lambda model: Gibbs([(PCN(model), noise_sites), (NUTS(model), None)]),
+    ],
+    ids=["PCN", "PCNL", "pilot", "MALA", "Gibbs"],
+)
+def test_every_kernel_refuses_it(kernel, tmp_path):
+    mcmc = MCMC(kernel(with_factor(draw_from_key)), num_warmup=1, num_samples=1, progress_bar=False)
+    with pytest.raises(ValueError, match="the model needs a random key"):
+        run_checkpointed(mcmc, tmp_path / "run", jr.key(0), DATA)
+    assert not (tmp_path / "run").exists()
+
+
+def test_sites_must_stay():
+    """What another argument of the model adds, no chain has."""
+
+    def growing(data, more=False):
+        model(data)
+        if more:
+            numpyro.sample("new", dist.Normal())
+
+    kernel = FunctionSpaceHMC(growing)
+    state = jax.eval_shape(lambda key: kernel.init(key, 0, None, (DATA,), {}), jr.key(0))
+    with pytest.raises(ValueError, match="site `new` would be drawn at random"):
+        jax.eval_shape(lambda state: kernel.sample(state, (DATA,), {"more": True}), state)
+
+
+def without_randomness(data):
+    """Plates and subsampling that take all, deterministic sites, control flow, a network with a prior, supports."""
+    with numpyro.plate("specimen", len(data), subsample_size=len(data)):
+        data = numpyro.subsample(jnp.asarray(data), event_dim=1)
+        width = numpyro.sample("width", dist.LogNormal(0.0, 0.1))
+    numpyro.deterministic("widths", 2 * width)
+    numpyro.sample("inside", dist.Uniform(0.0, jnp.sum(width)))
+
+    def step(total, _):
+        total, _ = scan(lambda x, _: (x + 1.0, None), total, None, length=2)
+        total = cond(total > 0, lambda x: 2 * x, lambda x: x, total)
+        return total + numpyro.sample("step", dist.Normal()), None
+
+    total, _ = scan(step, 0.0, None, length=3)
+    network = random_eqx_module("network", eqx.nn.Linear(1, 1, key=jr.key(0)), prior=dist.Normal())
+    numpyro.factor("more", total + network(jnp.ones(1))[0])
+    model(data)
+
+
+def test_what_is_not_random_goes_on():
+    """With the posterior that NumPyro gives the same model under a seed, which plays no part."""
+    seeded = numpyro.handlers.seed(without_randomness, 3)
+    latent = {name: site for name, site in sites_of(without_randomness, (DATA,), {}).items() if is_latent(site)}
+    z = {name: 0.1 * jnp.ones(jnp.shape(site["value"])) for name, site in latent.items()}
+    prior = np.sum(z["wing_noise"] ** 2 + np.log(2 * np.pi)) / 2
+    expected = potential_energy(seeded, (DATA,), {}, z) - prior
+    np.testing.assert_allclose(misfit(without_randomness, (DATA,), {}, z), expected, rtol=1e-12)
+    values = FunctionSpaceHMC(without_randomness).postprocess_fn((DATA,), {})(z)
+    assert set(values) == set(z) | {"widths"}
+    np.testing.assert_allclose(values["widths"], 2 * np.exp(0.1))
+    own_seed = numpyro.handlers.seed(model, 0)
+    assert misfit(own_seed, (DATA,), {}, z) == misfit(model, (DATA,), {}, z)
+
+
+def nested(data, bound=None):
+    top = numpyro.sample("top", dist.LogNormal(0.0, 1.0))
+    own = numpyro.sample("own", dist.LogNormal(jnp.log(top), 1.0))
+    numpyro.sample("inner", dist.Uniform(0.0, own if bound is None else bound * top))
+    model(data)
+
+
+def test_supports_across_blocks():
+    """`Gibbs` asks for the values of a block before it knows the others': their supports must not depend on them."""
+    kernel = Gibbs([(FunctionSpaceHMC(nested), ["own", "inner", "mean", "wing_noise"]), (NUTS(nested), ["top"])])
+    with pytest.raises(ValueError, match=r"supports of the sites \['inner'\] depend on sites of other blocks"):
+        kernel.init(jr.key(0), 0, None, (DATA, 2.0), {})
+    jax.eval_shape(lambda key: kernel.init(key, 0, None, (DATA,), {}), jr.key(0))
+
+
+@jax.custom_jvp
+def without_slope(x):
+    return x
+
+
+@without_slope.defjvp
+def _(x, dx):
+    return x[0], jnp.where(x[0] > 0, jnp.nan, 1.0) * dx[0]
+
+
+def no_slope(data):
+    model(data)
+    scale = numpyro.sample("scale", dist.LogNormal(jnp.zeros(3), 0.1).to_event(1))
+    numpyro.factor("more", 0.01 * without_slope(scale[:2]))
+
+
+def no_density(data):
+    model(data)
+    numpyro.factor("more", jnp.array([0.0, -jnp.inf]))
+
+
+STARTS = {
+    "gradient": (FunctionSpaceHMC, no_slope, None, "gradient is not finite.*gradient of `scale`, nan in 2 of 3"),
+    "MALA": (CorrelatedPseudoMarginalMALA, no_slope, None, "gradient is not finite.*gradient of `scale`, nan in 2"),
+    "density": (FunctionSpaceHMC, no_density, None, "energy is inf at.*log density of `more`, -inf in 1 of 2 entries"),
+    "value": (FunctionSpaceHMC, model, {"mean": jnp.inf}, "energy is .*Not finite: the value of `mean`, inf in 1 of 1"),
+    "name": (FunctionSpaceHMC, model, {"meen": 0.1}, r"values for \['meen'\]; the latent sites are \['mean', 'wing_n"),
+    "shape": (FunctionSpaceHMC, model, {"mean": jnp.zeros(2)}, r"must have shape \(\), unconstrained; got \(2,\)"),
+    "kind": (FunctionSpaceHMC, model, {"mean": "0.1"}, r"`init_params\['mean'\]` must be a number"),
+    "no dictionary": (FunctionSpaceHMC, model, [0.1], "`init_params` must be a dictionary by sites"),
+}
+
+
+@pytest.mark.parametrize("name", STARTS)
+def test_starts(name):
+    kernel, model, init_params, message = STARTS[name]
+    kernel = kernel(model, 2) if kernel is CorrelatedPseudoMarginalMALA else kernel(model)
+    with pytest.raises(ValueError, match=message):
+        kernel.init(jr.key(0), 0, init_params, (DATA,), {})
+
+
+def test_start_of_one_of_several_chains():
+    keys = jr.split(jr.key(0), 3)
+    kernel = FunctionSpaceHMC(model)
+    with pytest.raises(ValueError, match="at the start of chain 1: .*the value of `mean`, inf in 1 of 1"):
+        kernel.init(keys, 0, {"mean": jnp.array([0.0, jnp.inf, jnp.nan])}, (DATA,), {})
+    with pytest.raises(ValueError, match=r"shape \(3,\), unconstrained, chains in front; got \(2,\)"):
+        kernel.init(keys, 0, {"mean": jnp.zeros(2)}, (DATA,), {})

@@ -11,7 +11,6 @@ P_i being the probability of that interval. All paths end in Γ. Where the guide
 diagonal, the weight is the product of the P_i, the same number for every noise.
 """
 
-from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -20,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from .._checks import as_float, concrete, require, require_finite
-from .._linalg import promote, varying_like
+from .._checks import as_float, known, require, require_finite
+from .._linalg import solve_lower, varying_like
 from .._types import State, Structured
 from ..sdes import AbstractSDE
 from ._base import AbstractCondition, AbstractMatch, Observation, Target, lift
@@ -37,16 +36,23 @@ class CylinderSet(AbstractCondition):
 
     - `lower`, `upper`: `(N, dim)`, or `(N,)` for plain vectors, or scalars broadcast to it, for the first N ≤ n rows of
       the state: values at points or coefficients of an orthonormal basis. An infinite bound leaves that side free;
-      equal bounds pin the coordinate. Rows that are known to be free are left out.
+      equal bounds pin the coordinate, and unequal ones never do, be they closer than single precision tells apart.
+      Rows whose bounds are known to be infinite, inside a traced function too, are left out. Bounds that are traced
+      themselves keep all their rows: the same probability, from other paths.
+
+    **Errors:** `ValueError` where `lower` exceeds `upper`, for NaN and for no rows. A traced `lower` above `upper`
+    weighs −inf, the set being empty; a traced NaN weighs NaN.
     """
 
     lower: State
     upper: State
+    lost: State
     rows: tuple[int, ...] = eqx.field(static=True)
     exact: ClassVar[bool] = True
     num_extra_noises: ClassVar[int] = 1
 
     def __init__(self, lower, upper):
+        low, high = known(lower, "lower"), known(upper, "upper")
         lower, upper = as_float(lower, "lower"), as_float(upper, "upper")
         shapes = lower.shape, upper.shape
         require(
@@ -54,25 +60,22 @@ class CylinderSet(AbstractCondition):
             f"`lower` and `upper` must have one shape, or one of them be a scalar; got {shapes[0]} and {shapes[1]}.",
         )
         lower, upper = jnp.broadcast_arrays(lower, upper)
-        require(lower.ndim >= 1, "`lower` and `upper` must have one row per coordinate, (N,) or (N, dim); got scalars.")
-        low, high = concrete(lower), concrete(upper)
+        require(
+            lower.ndim >= 1,
+            "`lower` and `upper` must have one row per coordinate, (N,) or (N, dim); got scalars.",
+        )
+        require(
+            lower.size >= 1,
+            f"`lower` and `upper` must bound at least one coordinate; got shape {lower.shape}.",
+        )
+        rows = np.arange(lower.shape[0])
+        lost = jnp.zeros_like(lower)
         if low is not None and high is not None:
-            require(
-                not (np.isnan(low).any() or np.isnan(high).any()),
-                f"`lower` and `upper` must not be NaN; got {low} and {high}. Use ±inf for a free side.",
-            )
-            bad = ~((low <= high) & (low < np.inf) & (high > -np.inf))
-            require(
-                not bad.any(),
-                f"`lower` must not exceed `upper`, or the set is empty; got {low[bad][:1]} above {high[bad][:1]} in "
-                f"{int(bad.sum())} entries. Exchange them.",
-            )
-            seen = (np.isfinite(low) | np.isfinite(high)).reshape(len(low), -1).any(1)
-            rows = np.flatnonzero(seen) if seen.any() else np.arange(1)
-        else:
-            rows = np.arange(lower.shape[0])
+            low, high = np.broadcast_arrays(low, high)
+            rows = _bounded_rows(low, high)
+            lost = jnp.asarray(_lost_width(low, high, lower.dtype), lower.dtype)
         self.rows = tuple(int(i) for i in rows)
-        self.lower, self.upper = lower[rows], upper[rows]
+        self.lower, self.upper, self.lost = lower[rows], upper[rows], lost[rows]
 
     def check(self, sde, x):
         n = x.shape[0]
@@ -92,63 +95,92 @@ class CylinderSet(AbstractCondition):
         low, high = self.lower.astype(x.dtype), self.upper.astype(x.dtype)
         return lift(self.observation(sde, x).operator, x, jnp.clip(x[np.array(self.rows)], low, high))
 
-    def _scan(self, mean: State, factor: Structured, choose: Callable[..., Array], driver: State):
-        """Coordinate after coordinate: its standardised interval, the value chosen in it, its log weight."""
-        m = mean.shape[0]
-        lower, upper = self.lower.astype(mean.dtype), self.upper.astype(mean.dtype)
+    def _bounds(self, like: State) -> tuple[State, State, State, Array]:
+        """Both bounds and the lost width in the precision of a state, and which coordinates are pinned."""
+        lower, upper, lost = (a.astype(like.dtype) for a in (self.lower, self.upper, self.lost))
+        return lower, upper, lost, (self.lower == self.upper) & (self.lost == 0)
 
-        def one(low: Array, high: Array, center: Array, z: Array, scale: Array):
-            low, high = _standardise(low, center, scale), _standardise(high, center, scale)
-            pinned = low == high
-            w = jnp.where(pinned, low, choose(z, jnp.where(pinned, -1.0, low), jnp.where(pinned, 1.0, high)))
-            chosen = log_interval_probability(low, high) + 0.5 * w * w + _LOG_SQRT_2PI + jnp.log(scale)
-            return w, jnp.where(pinned, 0.0, chosen)
+    def _scan(self, mean: State, factor: Structured, driver: State) -> tuple[State, State]:
+        """Coordinate after coordinate: the value chosen in its interval, and the log weight of the choice."""
+        m = mean.shape[0]
+        bounds = self._bounds(mean)
+
+        def one(interval: tuple[Array, ...], center: Array, z: Array, scale: Array):
+            low, high, lost, pinned = interval
+            drawn = truncated_quantile(z, *_free_where(pinned, low, high), center, scale, lost)
+            value = jnp.where(pinned, low, drawn)
+            w = (value - center) / scale
+            inside = log_interval_probability(*_free_where(pinned, low, high), center, scale, lost)
+            chosen = inside + 0.5 * w * w + _LOG_SQRT_2PI + jnp.log(scale)
+            return value, jnp.where(pinned, 0.0, chosen), w
 
         if factor.ndim < 2:
-            d = jnp.broadcast_to(factor, (m,)) if mean.ndim == 1 else jnp.broadcast_to(factor, (m,))[:, None]
-            return one(lower, upper, mean, driver, d)
+            value, log_weight, _ = one(bounds, mean, driver, _column(factor, mean))
+            return value, log_weight
 
         def step(w, i):
-            w_i, log_weight = one(lower[i], upper[i], mean[i] + factor[i] @ w, driver[i], factor[i, i])
-            return w.at[i].set(w_i), log_weight
+            interval = tuple(a[i] for a in bounds)
+            value, log_weight, w_i = one(interval, mean[i] + factor[i] @ w, driver[i], factor[i, i])
+            return w.at[i].set(w_i), (value, log_weight)
 
-        start = varying_like(jnp.zeros_like(mean), mean, factor, driver, lower, upper)
-        return jax.lax.scan(step, start, jnp.arange(m))
+        start = varying_like(jnp.zeros_like(mean), mean, factor, driver, *bounds)
+        return jax.lax.scan(step, start, jnp.arange(m))[1]
 
     def log_value(self, law_mean, law_factor):
         """In product form: coordinates independent given the state."""
+        lower, upper, lost, pinned = self._bounds(law_mean)
         scale = law_factor if law_factor.ndim < 2 else jnp.linalg.norm(law_factor, axis=1)
-        scale = scale[:, None] if scale.ndim and law_mean.ndim == 2 else scale
-        low, high = _standardise(self.lower, law_mean, scale), _standardise(self.upper, law_mean, scale)
-        pinned = low == high
-        density = -0.5 * low**2 - _LOG_SQRT_2PI - jnp.log(scale)
-        inside = log_interval_probability(jnp.where(pinned, -1.0, low), jnp.where(pinned, 1.0, high))
+        scale = _column(scale, law_mean)
+        w = (jnp.where(pinned, lower, 0.0) - law_mean) / scale
+        density = -0.5 * w * w - _LOG_SQRT_2PI - jnp.log(scale)
+        inside = log_interval_probability(*_free_where(pinned, lower, upper), law_mean, scale, lost)
         return jnp.sum(jnp.where(pinned, density, inside))
 
     def target(self, law_mean, law_factor, noise):
-        m = law_mean.shape[0]
-        w, log_weights = self._scan(law_mean, law_factor, truncated_quantile, noise[0, :m])
-        d: Array = law_factor[:, None] if law_factor.ndim == 1 and w.ndim == 2 else law_factor
-        value = law_mean + (law_factor @ w if law_factor.ndim == 2 else d * w)
-        low, high = self.lower.astype(value.dtype), self.upper.astype(value.dtype)
-        return Target(jnp.clip(value, low, high), jnp.sum(log_weights))
+        value, log_weights = self._scan(law_mean, law_factor, noise[0, : law_mean.shape[0]])
+        return Target(value, jnp.sum(log_weights))
 
     def noise_from_target(self, law_mean, law_factor, seen):
-        m = law_mean.shape[0]
-        factor = promote(law_factor, 2, m)
-        w = jnp.linalg.solve(factor, seen - law_mean)
-        scale = jnp.diagonal(factor) if seen.ndim == 1 else jnp.diagonal(factor)[:, None]
-        center = seen - scale * w
-        low, high = _standardise(self.lower, center, scale), _standardise(self.upper, center, scale)
-        pinned = low == high
-        z = truncated_quantile_inverse(w, jnp.where(pinned, -jnp.inf, low), jnp.where(pinned, jnp.inf, high))
-        return z[None]
+        lower, upper, lost, pinned = self._bounds(seen)
+        center, scale = law_mean, law_factor
+        if law_factor.ndim == 2:
+            scale = _column(jnp.diagonal(law_factor), seen)
+            center = seen - scale * solve_lower(law_factor, seen - law_mean)
+        scale = _column(scale, seen)
+        return truncated_quantile_inverse(seen, *_free_where(pinned, lower, upper), center, scale, lost)[None]
 
 
-def _standardise(bound: State, mean: State, scale: State) -> State:
-    """(bound − mean)/scale, with finite gradients where the bound is infinite."""
-    infinite = jnp.isinf(bound)
-    return jnp.where(infinite, bound, (jnp.where(infinite, 0.0, bound) - mean) / scale)
+def _bounded_rows(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Rows with a finite bound, of bounds that are known; the first if there is none."""
+    require(
+        not (np.isnan(low).any() or np.isnan(high).any()),
+        f"`lower` and `upper` must not be NaN; got {low} and {high}. Use ±inf for a free side.",
+    )
+    bad = ~((low <= high) & (low < np.inf) & (high > -np.inf))
+    require(
+        not bad.any(),
+        f"`lower` must not exceed `upper`, or the set is empty; got {low[bad][:1]} above {high[bad][:1]} in "
+        f"{int(bad.sum())} entries. Exchange them.",
+    )
+    seen = (np.isfinite(low) | np.isfinite(high)).reshape(len(low), -1).any(1)
+    return np.flatnonzero(seen) if seen.any() else np.arange(1)
+
+
+def _lost_width(low: np.ndarray, high: np.ndarray, dtype) -> np.ndarray:
+    """What high − low loses where both are rounded to `dtype`; 0 where one of them is infinite."""
+    finite = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(finite, low, 0.0), np.where(finite, high, 0.0)
+    return (high - low) - (high.astype(dtype) - low.astype(dtype)).astype(float)
+
+
+def _free_where(pinned: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Bounds that are harmless where a coordinate is pinned."""
+    return jnp.where(pinned, -jnp.inf, lower), jnp.where(pinned, jnp.inf, upper)
+
+
+def _column(d: Structured, x: State) -> Structured:
+    """A scalar or diagonal shaped to scale the rows of x."""
+    return d[:, None] if d.ndim == 1 and x.ndim == 2 else d
 
 
 class IntervalCensored(AbstractMatch):
@@ -160,30 +192,39 @@ class IntervalCensored(AbstractMatch):
     """
 
     cuts: Array
+    lost: Array
     exact: ClassVar[bool] = True
 
     def __init__(self, cuts):
+        value = known(cuts, "cuts")
         self.cuts = as_float(cuts, "cuts")
-        value = concrete(self.cuts)
         require(
             self.cuts.ndim == 1 and self.cuts.size >= 1,
             f"`cuts` must be a vector of cut points; got shape {self.cuts.shape}.",
         )
         require_finite(self.cuts, "cuts", "The outer bins are open without it.")
-        require(value is None or np.all(np.diff(value) > 0), f"`cuts` must increase; got {value}. Sort them.")
+        self.lost = jnp.zeros((self.cuts.size + 1,), self.cuts.dtype)
+        if value is not None:
+            require(np.all(np.diff(value) > 0), f"`cuts` must increase; got {value}. Sort them.")
+            lost = _lost_width(value[:-1], value[1:], self.cuts.dtype)
+            self.lost = self.lost.at[1:-1].set(jnp.asarray(lost, self.cuts.dtype))
 
     def at(self, observed) -> AbstractCondition:
-        bins = as_float(observed, "observed")
-        value = concrete(bins)
+        """The set of the bins `observed`; a traced number that is none of a bin weighs NaN."""
+        value = known(observed, "observed")
+        numbers = as_float(observed, "observed")
+        count = self.cuts.size
         require(
-            value is None or np.all((value == np.round(value)) & (value >= 0) & (value <= self.cuts.size)),
-            f"`observed` must hold bin numbers from 0 to {self.cuts.size}; got {value}. Values are put into bins by "
+            value is None or np.all((value == np.round(value)) & (value >= 0) & (value <= count)),
+            f"`observed` must hold bin numbers from 0 to {count}; got {value}. Values are put into bins by "
             "`numpy.searchsorted(cuts, values)`.",
         )
-        bins = bins.astype(int)
+        bins = jnp.clip(numbers, 0, count).astype(int)
         infinity = jnp.full((1,), jnp.inf, self.cuts.dtype)
         edges = jnp.concatenate([-infinity, self.cuts, infinity])
-        return CylinderSet(edges[bins], edges[bins + 1])
+        is_bin = numbers == bins.astype(numbers.dtype)
+        box = CylinderSet(*(jnp.where(is_bin, edges[i], jnp.nan) for i in (bins, bins + 1)))
+        return eqx.tree_at(lambda box: box.lost, box, self.lost[bins])
 
     def sample(self, key: PRNGKeyArray, sde: AbstractSDE, x: State) -> Array:
         return jnp.searchsorted(self.cuts, x).astype(x.dtype)

@@ -8,9 +8,20 @@ import jax.numpy as jnp
 import jax.random as jr
 import lineax as lx
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, PRNGKeyArray
 
-from .._checks import as_float, concrete, require, require_finite, require_instance, require_positive
+from .._checks import (
+    as_float,
+    concrete,
+    flag,
+    known,
+    require,
+    require_finite,
+    require_instance,
+    require_positive,
+    words,
+)
 from .._linalg import apply, cholesky, columns, congruence, diagonal, solve_lower, symmetric
 from .._types import State, Structured
 from ..sdes import AbstractSDE
@@ -72,7 +83,8 @@ class ExactMatch(AbstractMatch):
     **Arguments:**
 
     - `operator`: L, `(m, n)` or a lineax operator; the identity if not given.
-    - `mask`: `(n,)` booleans instead of `operator`: which rows are seen (known when the program is traced).
+    - `mask`: `(n,)` booleans instead of `operator`: which rows are seen. It is a constant, inside a traced function
+      too, since it says how many rows a datum has.
     """
 
     operator: Structured
@@ -81,10 +93,12 @@ class ExactMatch(AbstractMatch):
     def __init__(self, operator=None, *, mask=None):
         if mask is not None:
             require(operator is None, "Give `operator` or `mask`, not both.")
-            keep = concrete(mask)
-            if keep is None:
-                raise ValueError("`mask` of an exact match must be known when the program is traced; use InexactMatch.")
-            keep = _mask(keep)
+            require(
+                not _is_traced(mask),
+                "`mask` of an exact match must be known when the program is traced; got a traced array. Give a NumPy "
+                "array, or use InexactMatch.",
+            )
+            keep = _mask(mask)
             require(keep.any(), "`mask` must leave at least one row to be seen; got all False.")
             operator = np.eye(len(keep))[keep]
         self.operator = _operator(operator)
@@ -112,10 +126,12 @@ class InexactMatch(AbstractMatch):
     **Arguments:**
 
     - `variance`: σ, positive: a number, or `(m,)` or `(m, m)` to be divided by the weights in the same way.
-    - `operator`: L, `(m, n)` or a lineax operator; the identity if not given. Rows of the identity (a selection of
-      points) keep their points' weights; any other operator is seen in the Euclidean norm of R^m.
+    - `operator`: L, `(m, n)` or a lineax operator; the identity if not given. An operator whose every row is a row of
+      the identity, a selection of points, keeps their weights; any other is seen in the Euclidean norm of R^m. Its
+      values say which it is, wherever the match is built.
     - `mask`: `(n,)` booleans instead of `operator`: which rows are seen. The datum's other rows are ignored.
-    - `space`: whose weights to use; the SDE's if not given, Euclidean where it has none.
+    - `space`: whose weights to use; the SDE's if not given, Euclidean where it has none. A space with one weight for
+      each row that an operator sees gives those rows its weights.
     - `normalised`: `True` is the Lebesgue density of the observation. `False` is the kernel itself, whose expectation
       has a limit as n → ∞; it is no density, so distributions refuse it.
 
@@ -127,7 +143,6 @@ class InexactMatch(AbstractMatch):
     mask: Bool[Array, " n"] | None
     space: AbstractSpace | None
     normalised: bool = eqx.field(static=True)
-    selected: tuple[int, ...] | None = eqx.field(static=True)
     exact: ClassVar[bool] = False
 
     def __init__(
@@ -151,11 +166,10 @@ class InexactMatch(AbstractMatch):
                 "`variance` must be a symmetric, positive definite matrix; its Cholesky factorisation fails. "
                 "Observe fewer combinations, or add a small multiple of the identity.",
             )
-        self.mask = None if mask is None else _mask(mask)
+        self.mask = None if mask is None else jnp.asarray(_mask(mask))
         self.operator = _operator(operator)
-        self.selected = _selection(self.operator)
         self.space = space
-        self.normalised = bool(normalised)
+        self.normalised = flag(normalised, "normalised")
 
     @classmethod
     def from_point_sd(cls, sd, space: AbstractSpace, **kwargs) -> "InexactMatch":
@@ -169,21 +183,35 @@ class InexactMatch(AbstractMatch):
         """The condition that `observed` was seen."""
         return _Seen(match=self, observed=_datum(observed, self.mask))
 
-    def _factor(self, sde: AbstractSDE, x: State) -> Structured:
+    def _weights(self, sde: AbstractSDE, x: State) -> Array | None:
+        """One weight for each row that is seen; `None` in Euclidean space."""
         space = sde.space if self.space is None else self.space
+        if space is None:
+            return None
+        weights, n = space.weights.astype(x.dtype), x.shape[0]
+        m = self.operator.shape[0] if self.operator.ndim == 2 else n
+        own = self.space is not None and weights.shape == (m,)
+        require(
+            own or weights.shape == (n,),
+            f"`space` must have one weight per row of the state, {n}, or per observed row, {m}; got {weights.shape}.",
+        )
+        if self.operator.ndim == 0:
+            return weights
+        others = weights if own else jnp.ones((m,), x.dtype)
+        if weights.shape != (n,):
+            return others
+        picked = self.operator == 1
+        is_selection = jnp.all(picked | (self.operator == 0)) & jnp.all(jnp.sum(picked, axis=1) == 1)
+        return jnp.where(is_selection, jnp.sum(jnp.where(picked, weights[None], 0.0), axis=1), others)
+
+    def _factor(self, sde: AbstractSDE, x: State) -> Structured:
         m = self.operator.shape[0] if self.operator.ndim == 2 else x.shape[0]
-        weights = None if space is None else space.weights.astype(x.dtype)
-        if weights is not None and self.operator.ndim == 2 and (self.space is None or weights.shape != (m,)):
-            weights = None if self.selected is None else weights[jnp.array(self.selected)]
         variance = symmetric(self.variance.astype(x.dtype))
         require(
             variance.ndim == 0 or variance.shape[0] == m,
             f"`variance` must be a scalar or have {m} rows, one per observed row; got shape {variance.shape}.",
         )
-        require(
-            weights is None or weights.shape == (m,),
-            f"`space` must have one weight per observed row, {m}; got {None if weights is None else weights.shape}.",
-        )
+        weights = self._weights(sde, x)
         if weights is not None:
             variance = congruence(1 / jnp.sqrt(weights), variance) if variance.ndim else variance / weights
         return cholesky(variance)
@@ -223,39 +251,40 @@ def _operator(operator) -> Structured:
         return jnp.ones(())
     if isinstance(operator, lx.AbstractLinearOperator):
         operator = operator.as_matrix()
+    value = known(operator, "operator")
     operator = as_float(operator, "operator")
     require(
         operator.ndim == 2,
         f"`operator` must be a matrix (m, n) with one row per observed value; got shape {operator.shape}.",
     )
-    require_finite(operator, "operator")
-    value = concrete(operator)
-    require(
-        value is None or np.linalg.matrix_rank(value) == len(value),
-        f"`operator` must have independent rows; its rank is below its {operator.shape[0]} rows. "
-        "Remove repeated observations.",
-    )
+    require(operator.size >= 1, f"`operator` must see at least one value of at least one row; got {operator.shape}.")
+    if value is not None:
+        require_finite(value, "operator")
+        require(
+            np.linalg.matrix_rank(value) == len(value),
+            f"`operator` must have independent rows; its rank is below its {operator.shape[0]} rows. "
+            "Remove repeated observations.",
+        )
     return operator
 
 
-def _mask(mask) -> Array:
-    """Which rows are seen, as booleans."""
-    value = concrete(mask)
-    shape = np.shape(mask) if value is None else value.shape
-    require(len(shape) == 1, f"`mask` must be a vector (n,), one entry for each row; got shape {shape}.")
+def _is_traced(mask) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(mask))
+
+
+def _mask(mask) -> Array | np.ndarray:
+    """Which rows are seen, as booleans: a NumPy array unless it is traced."""
+    value = jnp.asarray(mask) if _is_traced(mask) else np.asarray(mask)
     require(
-        value is None or np.all((value == 0) | (value == 1)),
-        f"`mask` must hold booleans, True where a row is seen; got {value}.",
+        value.ndim == 1,
+        f"`mask` must be a vector (n,), one entry for each row; got shape {value.shape}.",
     )
-    return jnp.asarray(mask, bool) if value is None else jnp.asarray(value.astype(bool))
-
-
-def _selection(operator: Structured) -> tuple[int, ...] | None:
-    """The rows of the identity that the operator consists of, if it does."""
-    value = concrete(operator)
-    if value is None or value.ndim < 2 or not np.all((value == 0) | (value == 1)) or not np.all(value.sum(1) == 1):
-        return None
-    return tuple(int(i) for i in value.argmax(1))
+    require(
+        value.dtype == bool,
+        f"`mask` must hold booleans, True where a row is seen; got {words(mask)}. From indices: "
+        "`numpy.isin(numpy.arange(n), indices)`; from zeros and ones: `numpy.asarray(mask) == 1`.",
+    )
+    return value
 
 
 def _datum(observed, mask=None) -> State:

@@ -110,6 +110,9 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         i, zero, no = jnp.zeros((), int), jnp.zeros_like(phi), jnp.array(False)
         return FunctionSpaceHMCState(i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key)
 
+    def _slopes(self, state):
+        return state.gradient
+
     def refresh(self, state, model_args, model_kwargs):
         phi, gradient = jax.value_and_grad(self._misfit)(state.z, model_args, model_kwargs)
         return state._replace(

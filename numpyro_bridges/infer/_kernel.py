@@ -3,6 +3,7 @@
 import copy
 import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from functools import partial
 
 import jax
@@ -19,8 +20,18 @@ from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import constrain_fn
 from numpyro.util import is_prng_key
 
-from .._checks import concrete, require, words
-from ._posterior import Sites, init_to_guided_mean, is_latent, is_noise, misfit, sites_of
+from .._checks import as_float, concrete, require, words
+from ._posterior import (
+    Sites,
+    constrained,
+    init_to_guided_mean,
+    is_latent,
+    is_noise,
+    misfit,
+    not_finite,
+    sites_of,
+    supports_that_move,
+)
 from ._reference import Reference, laplace
 
 # Rules of settings, in words and as a test.
@@ -67,9 +78,12 @@ class AbstractBridgeKernel(MCMCKernel):
     def init(self, rng_key, num_warmup, init_params, model_args, model_kwargs):
         model_kwargs = dict(model_kwargs or {})
         self._num_warmup = num_warmup
-        self._check(model_args, model_kwargs)
-        if init_params is not None and GIBBS_SITES_KWARG in model_kwargs:  # `Gibbs` passes constrained values
-            init_params = self._unconstrained(init_params, model_args, model_kwargs)
+        sites = self._check(model_args, model_kwargs)
+        num_chains = None if is_prng_key(rng_key) else len(rng_key)
+        if init_params is not None:
+            # `Gibbs` passes constrained values
+            constrained = GIBBS_SITES_KWARG in model_kwargs
+            init_params = _starts(init_params, sites, constrained, num_chains) or None
 
         def one(key, init_params):
             key, key_start, key_reference = jr.split(key, 3)
@@ -77,18 +91,14 @@ class AbstractBridgeKernel(MCMCKernel):
             z, reference = self._near_the_mode(key_reference, z, init_params is not None, model_args, model_kwargs)
             return self._init_one(key, z, reference, model_args, model_kwargs)
 
-        over_chains = (lambda fn: fn) if is_prng_key(rng_key) else partial(_over_chains, num_chains=len(rng_key))
+        over_chains = (lambda fn: fn) if num_chains is None else partial(_over_chains, num_chains=num_chains)
 
         def sample(state, model_args, model_kwargs):
             return over_chains(lambda state: self._sample_one(state, model_args, model_kwargs))(state)
 
         self._sample_fn = sample
         state = jax.jit(over_chains(one))(rng_key, init_params)
-        potential = concrete(state.potential_energy)
-        require(
-            potential is None or bool(np.all(np.isfinite(potential))),
-            f"the potential energy is {potential} at the start: give other `init_params`, or check the model's data.",
-        )
+        self._check_start(state, num_chains, model_args, model_kwargs)
         return state
 
     def sample(self, state, model_args, model_kwargs):
@@ -99,10 +109,12 @@ class AbstractBridgeKernel(MCMCKernel):
 
     def postprocess_fn(self, model_args, model_kwargs):
         """Constrained values, and those of deterministic sites."""
-        return partial(constrain_fn, self._seeded, model_args, model_kwargs or {}, return_deterministic=True)
+        return partial(constrained, self._model, model_args, model_kwargs or {})
 
     def get_constrain_fn(self, model_args, model_kwargs):
-        return partial(constrain_fn, self._seeded, model_args, model_kwargs or {})
+        # For the sites of other blocks of `Gibbs`, on which no support depends, any value will do.
+        seeded = numpyro.handlers.seed(self._model, 0)
+        return partial(constrain_fn, seeded, model_args, model_kwargs or {})
 
     def wrap_model(self, wrapper):
         kernel = copy.copy(self)
@@ -111,10 +123,6 @@ class AbstractBridgeKernel(MCMCKernel):
 
     def __getstate__(self):
         return self.__dict__ | {"_sample_fn": None}
-
-    @property
-    def _seeded(self):
-        return numpyro.handlers.seed(self._model, 0)
 
     def _latent(self, key, strategy, model_args, model_kwargs):
         """The latent sites, with values by an initialisation strategy."""
@@ -132,14 +140,53 @@ class AbstractBridgeKernel(MCMCKernel):
             f"{name} found no driving noise among the latent sites {sorted(sites)}: observe a law with "
             "`numpyro_bridges.sample`, or mark the noise's site by `infer={'driving_noise': True}`.",
         )
+        others = model_kwargs.get(GIBBS_SITES_KWARG)
+        if others and set(sites) != set(self._noise):
+            self._check_supports(sites, others, model_args, model_kwargs)
+        return sites
+
+    def _check_supports(self, sites, others, model_args, model_kwargs):
+        """`Gibbs` asks for the constrained values of a block without those of the others."""
+        own = {name: site["value"] for name, site in sites.items()}
+
+        def given(others):
+            kwargs = model_kwargs | {GIBBS_SITES_KWARG: others}
+            return self._latent(0, lambda site: own.get(site["name"]), model_args, kwargs)
+
+        moving = supports_that_move(given, others)
+        require(
+            not moving,
+            f"the supports of the sites {moving} depend on sites of other blocks of `Gibbs`: make them one block.",
+        )
+
+    def _check_start(self, state, num_chains, model_args, model_kwargs):
+        """The energy, and the gradient if the kernel follows it, are finite where each chain starts."""
+        slopes = jax.tree.leaves(self._slopes(state))
+        known = [x for x in map(concrete, (state.potential_energy, *slopes)) if x is not None]
+        if len(known) <= len(slopes):  # some are traced
+            return
+        rows = [x.reshape(num_chains or 1, -1) for x in known]
+        good = np.all([np.isfinite(x).all(1) for x in rows], axis=0)
+        if good.all():
+            return
+        chain = int(np.argmin(good))
+        z = state.z if num_chains is None else {name: x[chain] for name, x in state.z.items()}
+        value = rows[0][chain, 0]
+        what = "gradient is not finite" if np.isfinite(value) else f"potential energy is {value}"
+        where = "" if num_chains is None else f" of chain {chain}"
+        found = not_finite(self._model, model_args, model_kwargs, z, bool(slopes))
+        raise ValueError(
+            f"the {what} at the start{where}: give other `init_params`, or check the model's data. "
+            f"Not finite: {'; '.join(found)}."
+        )
+
+    def _slopes(self, state):
+        """The gradient that the kernel follows."""
+        return state.force
 
     def _start(self, key, model_args, model_kwargs) -> Sites:
         sites = self._latent(key, self._init_strategy, model_args, model_kwargs)
         return {k: biject_to(site["fn"].support).inv(site["value"]) for k, site in sites.items()}
-
-    def _unconstrained(self, values, model_args, model_kwargs) -> Sites:
-        sites = self._latent(0, init_to_sample, model_args, model_kwargs)
-        return {k: biject_to(sites[k]["fn"].support).inv(jnp.asarray(v)) for k, v in values.items()}
 
     def _near_the_mode(self, key, z, stay, model_args, model_kwargs):
         """A Laplace approximation of the parameters' posterior, and a start drawn from it unless one was given."""
@@ -165,6 +212,26 @@ class AbstractBridgeKernel(MCMCKernel):
         n = jnp.where(self._warming(state), state.i, state.i - self._num_warmup) + 1
         mean = jnp.where(n == 1, 0.0, state.mean_accept_prob)
         return mean + (rate - mean) / n
+
+
+def _starts(values, sites, constrained: bool, num_chains: int | None) -> Sites:
+    """`init_params` as unconstrained arrays, chains in front."""
+    require(isinstance(values, Mapping), f"`init_params` must be a dictionary by sites; got {words(values)}.")
+    unknown = sorted(set(values) - set(sites))
+    require(not unknown, f"`init_params` has values for {unknown}; the latent sites are {sorted(sites)}.")
+    chains = () if num_chains is None else (num_chains,)
+    starts = {}
+    for name, value in values.items():
+        transform, shape = biject_to(sites[name]["fn"].support), jnp.shape(sites[name]["value"])
+        shape = chains + (shape if constrained else transform.inverse_shape(shape))
+        x = as_float(value, f"init_params['{name}']")
+        require(
+            x.shape == shape,
+            f"`init_params['{name}']` must have shape {shape}, {'' if constrained else 'un'}constrained"
+            f"{', chains in front' if chains else ''}; got {x.shape}.",
+        )
+        starts[name] = transform.inv(x) if constrained else x
+    return starts
 
 
 def _over_chains(fn, num_chains: int):

@@ -11,12 +11,13 @@ from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jax import Array
 from numpyro.distributions import constraints
 from numpyro.infer import init_to_median, init_to_sample
-from numpyro.infer.util import potential_energy
+from numpyro.infer.util import compute_log_probs, constrain_fn, potential_energy
 from numpyro.primitives import Messenger
 
 from .._checks import require_instance
@@ -53,6 +54,54 @@ def noise_sites(trace) -> tuple[str, ...]:
     return tuple(name for name, site in trace.items() if is_noise(site) and not site["is_observed"])
 
 
+def _refuse_to_draw(site):
+    """For `substitute`: the site of a sample, or of a plate's subset, that nothing has given a value."""
+    if site["value"] is not None or site["type"] not in ("sample", "plate"):
+        return
+    name = site["name"]
+    if site["type"] == "plate":
+        size, subsample_size = site["args"]
+        raise ValueError(
+            f"plate `{name}` draws {subsample_size} of its {size} data at random, and a chain would see "
+            "one draw of them for ever: leave out `subsample_size`. Minibatches are for `SVI`; kernels "
+            "that correct for them, such as `HMCECS`, cannot hold this one."
+        )
+    raise ValueError(
+        f"site `{name}` would be drawn at random wherever the model is evaluated: it is not among the "
+        "sites whose values the kernel has. A model must have the same latent sites at every call."
+    )
+
+
+class _AsGiven(numpyro.handlers.substitute):
+    """A context in which a model that draws at random, beyond the values of its sites, raises `ValueError`.
+
+    There is no random key, not even one of a `seed` handler inside or outside. What has no value is
+    refused by its name, within control flow too. `numpyro.prng_key()` gives `None`, which does no
+    harm to those that ask and do not draw, such as Equinox modules.
+    """
+
+    def __init__(self):
+        super().__init__(substitute_fn=_refuse_to_draw)
+        self._asked = False
+
+    def process_message(self, msg):
+        super().process_message(msg)
+        if msg["type"] in ("prng_key", "control_flow"):
+            fn = msg["fn"]
+            msg["fn"] = lambda *args, rng_key=None, **kwargs: fn(*args, rng_key=None, **kwargs)
+            self._asked |= msg["type"] == "prng_key"
+
+    def __exit__(self, kind, error, traceback):
+        super().__exit__(kind, error, traceback)
+        if self._asked and isinstance(error, Exception):
+            raise ValueError(
+                "the model needs a random key: for `numpyro.prng_key()`, the initial values of a network, "
+                "or a site under `handlers.block`. A chain would use one draw for ever. Draw by "
+                "`numpyro.sample`, or pass what was drawn as an argument, a network's parameters by "
+                f"`handlers.substitute`. Without a key came {kind.__name__}: {error}"
+            ) from error
+
+
 class _Nothing(dist.ImproperUniform):
     """Has log density 0, and does not look at the value."""
 
@@ -87,9 +136,52 @@ class _Split(Messenger):
 
 def split(model, model_args, model_kwargs, z: Sites) -> tuple[Array, Sites]:
     """rest(θ), and log p(v_s | θ, z_s) of every site that noise drives, shaped as its batch."""
-    parts = _Split(numpyro.handlers.seed(model, 0))
-    rest = jnp.asarray(potential_energy(parts, model_args, model_kwargs, z))
+    parts = _Split(model)
+    with _AsGiven():
+        rest = jnp.asarray(potential_energy(parts, model_args, model_kwargs, z))
     return rest, parts.log_likelihood
+
+
+def constrained(model, model_args, model_kwargs, z: Sites) -> Sites:
+    """Constrained values of latent sites, and the values of deterministic ones."""
+    with _AsGiven():
+        return constrain_fn(model, model_args, model_kwargs, z, return_deterministic=True)
+
+
+def supports_that_move(sites, values: Sites) -> list[str]:
+    """Of the sites that a function of `values` gives, those whose support depends on the values."""
+
+    def bounds(values):
+        leaves = {name: jax.tree.leaves(site["fn"].support) for name, site in sites(values).items()}
+        return {name: [x for x in own if isinstance(x, Array)] for name, own in leaves.items()}
+
+    closed, shapes = jax.make_jaxpr(bounds, return_shape=True)(values)
+    names = [name for name in sorted(shapes) for _ in shapes[name]]  # the order of the outputs
+    outputs = zip(names, closed.jaxpr.outvars, strict=True)
+    return sorted({name for name, out in outputs if _inputs_of(closed.jaxpr, out)})
+
+
+def not_finite(model, model_args, model_kwargs, z: Sites, with_gradient: bool) -> list[str]:
+    """What is not finite of the posterior at z, site by site, in words."""
+
+    def log_densities(z):
+        with _AsGiven():
+            values = constrain_fn(model, model_args, model_kwargs, z)
+            return compute_log_probs(model, model_args, model_kwargs, values, sum_log_prob=False)[0]
+
+    def phi(z):
+        return misfit(model, model_args, model_kwargs, z)
+
+    # Traced, so that no check of values stands in the way.
+    gradient = jax.jit(jax.grad(phi))(z) if with_gradient else {}
+    found = {"value": z, "log density": jax.jit(log_densities)(z), "gradient": gradient}
+    words = []
+    for what, sites in found.items():
+        for name, x in sites.items():
+            bad = np.asarray(x)[~np.isfinite(x)]
+            if bad.size:
+                words.append(f"the {what} of `{name}`, {bad[0]} in {bad.size} of {np.size(x)} entries")
+    return words
 
 
 def misfit(model, model_args, model_kwargs, z: Sites) -> Array:

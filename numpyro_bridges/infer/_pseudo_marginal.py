@@ -92,7 +92,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         return f"{self._num_particles} particles, step size {step:.2e}. acc. prob={rate:.2f}"
 
     def _check(self, model_args, model_kwargs):
-        super()._check(model_args, model_kwargs)
+        sites = super()._check(model_args, model_kwargs)
         if self._num_particles is None:
             with jax.ensure_compile_time_eval():
                 log_weights = self._pilot(model_args, model_kwargs)
@@ -102,6 +102,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
                 "`num_particles` must be given where the model's arguments are traced.",
             )
             self._num_particles = _choose(weights, self._max_particles)
+        return sites
 
     def _pilot(self, model_args, model_kwargs):
         """Log weights of bridges at the mode of the parameters, `(bridges, data)`."""
