@@ -105,6 +105,15 @@ def known_float(x: Any, name: str) -> np.ndarray:
     return np.asarray(x, float)
 
 
+def exact_float(x: Any, name: str) -> jax.Array | np.ndarray:
+    """A NumPy array of double precision where the value is known, whatever the default; a traced one as it is.
+
+    For what must be subtracted before it is rounded, such as times.
+    """
+    x = _real(x, name)
+    return jnp.asarray(x, float) if isinstance(x, Tracer) else np.asarray(x, float)
+
+
 def _real(x: Any, name: str) -> jax.Array | np.ndarray:
     """x as an array of a real type, its own where it has one."""
     kind = _kind(x)

@@ -261,14 +261,15 @@ def _checked_score_error(bridge: GuidedBridge, score, keys) -> float:
 @eqx.filter_jit
 @full_precision
 def _score_error(bridge: GuidedBridge, score, keys):
-    def squares(t, x):
-        s, s_exact = bridge.score(t, x), score(t, x)
+    def squares(t, x, s):
+        s_exact = score(t, x)
         a = bridge.sde.covariance(t, x)
         return jnp.stack([jnp.sum(u * apply(a, u)) for u in (s - s_exact, s_exact)])
 
     def integrals(key):
         path, log_weight = bridge.path_and_log_weight(_noise(bridge, key))
-        return jnp.diff(bridge.ts) @ jax.vmap(squares)(bridge.ts[:-1], path[:-1]), log_weight
+        along = jax.vmap(squares)(bridge.ts[:-1], path[:-1], bridge.scores(path))
+        return jnp.diff(bridge.grid.elapsed) @ along, log_weight
 
     found, log_weights = jax.lax.map(integrals, keys)
     error, size = jax.nn.softmax(log_weights) @ found

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 
 import diffrax
 import equinox as eqx
@@ -16,18 +16,17 @@ from ._types import RealScalar, State
 from .conditioning import AbstractCondition, GaussianMessage, Observation, Target
 from .guiding import (
     AbstractGuide,
-    GridNoise,
+    AbstractPlan,
     GuidedStep,
     arrive,
     default_guide,
     exact_message,
     levy_area,
     retrace,
-    time_grid,
     travel,
     travel_continuous,
 )
-from .sdes import AbstractSDE
+from .sdes import AbstractSDE, Frame, TimeGrid, still_frame, time_grid
 
 Method = TypeVar("Method", bound=Callable)
 
@@ -48,6 +47,16 @@ def _pure_method(method: Method) -> Method:
     return cast(Method, _PureMethod(method))
 
 
+class Problem(NamedTuple):
+    """A bridge as it is computed: displacements from a frame, times that have elapsed."""
+
+    frame: Frame
+    condition: AbstractCondition
+    seen: Observation
+    reference: State
+    ts: Float[Array, " K+1"]
+
+
 class GuidedBridge(eqx.Module):
     """The process X on [t0, t1] from x0, conditioned on its end state, driven by standard normal noise.
 
@@ -63,9 +72,10 @@ class GuidedBridge(eqx.Module):
     - `sde`: an `AbstractSDE`.
     - `condition`: `match.at(v)` or a `CylinderSet`.
     - `x0`: `(n, dim)` or `(n,)`.
-    - `t1`, `t0`: the interval, in the time units of the SDE.
+    - `t1`, `t0`: the interval, in the time units of the SDE; t0 is 0 unless given.
     - `num_steps`, or `ts`: the number of steps of the default grid, or an increasing grid `(K + 1,)` from t0 to t1. The
-      default is uniform, and graded towards t1, t = s(2 − s/T), where the end state is pinned.
+      default is uniform, and graded towards t1, t = s(2 − s/T), where the end state is pinned. A grid whose steps
+      vanish in the precision used is refused.
     - `guide`: by default `RecedingGuide()` where a depends on the state and `FrozenGuide()` where it is constant.
     - `solver`: by default the guided step with its exact discrete weight. An Itô diffrax solver steps the guided drift
       instead, with the continuous-time weight: consistent as dt → 0, biased at fixed dt, and no target for MCMC. A
@@ -77,7 +87,8 @@ class GuidedBridge(eqx.Module):
     sde: AbstractSDE
     condition: AbstractCondition
     x0: State
-    ts: Float[Array, " K+1"]
+    grid: TimeGrid
+    clock: Float[Array, ""]
     guide: AbstractGuide
     solver: diffrax.AbstractSolver
 
@@ -88,7 +99,7 @@ class GuidedBridge(eqx.Module):
         *,
         x0: State,
         t1: RealScalar | None = None,
-        t0: RealScalar = 0.0,
+        t0: RealScalar | None = None,
         num_steps: int | None = None,
         ts=None,
         guide: AbstractGuide | None = None,
@@ -112,7 +123,8 @@ class GuidedBridge(eqx.Module):
         require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         guide.check(sde, x0)
         self.sde, self.condition, self.x0, self.guide = sde, condition, x0, guide
-        self.ts = time_grid(t0, t1, num_steps, ts, graded=condition.exact)
+        self.grid = time_grid(t0, t1, num_steps, ts, graded=condition.exact)
+        self.clock = self.grid.clock(sde, x0)
         self.solver = GuidedStep() if solver is None else solver
         self._check_solver()
         if condition.exact:
@@ -130,11 +142,11 @@ class GuidedBridge(eqx.Module):
             f"`solver` must be a diffrax solver for SDEs, such as `diffrax.Euler()`; got {self.solver!r}.",
         )
         if not self._is_discrete:
-            seen, reference = self.end()
-            auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
+            frame, _, seen, reference, ts = self.problem()
+            auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
             if self.condition.exact:
-                a = congruence(seen.operator, self.sde.covariance(self.ts[-1], reference))
-                a_aux = congruence(seen.operator, auxiliary.covariance(self.ts[-1], reference))
+                a = congruence(seen.operator, frame.sde.covariance(ts[-1], reference))
+                a_aux = congruence(seen.operator, auxiliary.covariance(ts[-1], reference))
                 ndim, m = max(a.ndim, a_aux.ndim), apply(seen.operator, reference).shape[0]
                 gap = jnp.max(jnp.abs(promote(a, ndim, m) - promote(a_aux, ndim, m)))
                 require(
@@ -146,8 +158,9 @@ class GuidedBridge(eqx.Module):
 
     def _check_exact(self):
         seen, _ = self.end()
-        dt = self.ts[-1] - self.ts[-2]
-        S = congruence(seen.operator, self.sde.transition(self.ts[0], self.ts[0] + dt, self.x0).covariance)
+        ts = self.grid.elapsed
+        law = self.sde.transition(self.clock, self.clock + (ts[-1] - ts[-2]), self.x0)
+        S = congruence(seen.operator, law.covariance)
         if concrete(S) is not None:
             pivots = jnp.linalg.cholesky(S) if S.ndim == 2 else jnp.sqrt(S)
             pivots = jnp.diagonal(pivots) if S.ndim == 2 else pivots
@@ -164,9 +177,19 @@ class GuidedBridge(eqx.Module):
         return isinstance(self.solver, GuidedStep)
 
     @property
+    def ts(self) -> Array:
+        """The grid `(K + 1,)`, from t0 to t1."""
+        return self.grid.ts
+
+    @property
+    def shown_ts(self) -> Float[Array, " K+1"]:
+        """The grid as the SDE sees it: times since t0 where it does not depend on the time."""
+        return self.clock + self.grid.elapsed
+
+    @property
     def num_steps(self) -> int:
         """Number of steps K."""
-        return self.ts.shape[0] - 1
+        return self.grid.num_steps
 
     @property
     def noise_shape(self) -> tuple[int, int, int]:
@@ -178,7 +201,7 @@ class GuidedBridge(eqx.Module):
 
     def with_guide(self, guide: AbstractGuide) -> "GuidedBridge":
         """The same bridge, led by another guide: the same estimand."""
-        return GuidedBridge(self.sde, self.condition, x0=self.x0, ts=self.ts, guide=guide, solver=self.solver)
+        return GuidedBridge(self.sde, self.condition, x0=self.x0, ts=self.grid, guide=guide, solver=self.solver)
 
     @_pure_method
     def path(self, noise: Float[Array, "K k dim"]) -> Float[Array, "K+1 n *dim"]:
@@ -212,58 +235,55 @@ class GuidedBridge(eqx.Module):
     def end(self) -> tuple[Observation, State]:
         """What is seen of the end state, and a state that meets the condition."""
         seen = self.condition.observation(self.sde, self.x0)
-        free = self.x0
+        free, ts = self.x0, self.shown_ts
+        dt = jnp.diff(self.grid.elapsed)
 
-        def drift_step(x, times):
-            return x + (times[1] - times[0]) * self.sde.drift(times[0], x), None
+        def drift_step(x, step):
+            t, dt = step
+            return x + dt * self.sde.drift(t, x), None
 
         if seen.operator.ndim or self.condition.num_extra_noises:  # part of the end state is open
-            start = varying_like(free, self.sde, self.ts)
-            free, _ = jax.lax.scan(drift_step, start, (self.ts[:-1], self.ts[1:]))
+            start = varying_like(free, self.sde, ts, dt)
+            free, _ = jax.lax.scan(drift_step, start, (ts[:-1], dt))
         reference = self.condition.reference(self.sde, free)
         return seen, reference
+
+    def problem(self, x: State | None = None, since: RealScalar = 0.0) -> Problem:
+        """What is computed, for a path from x at the time `since`, which has elapsed; from the start if not given.
+
+        In displacements from a state that meets the condition, what is exactly seen keeps its digits to the end.
+        """
+        seen, end = self.end()
+        x = self.x0 if x is None else x
+        if self._is_discrete and self.guide.moves:
+            left = jnp.maximum(self.grid.elapsed, since) - since
+            frame = self.sde.frame(x, end, left, self.clock)
+        else:
+            frame = still_frame(self.sde, x, end, self.grid.elapsed, self.clock)
+        condition = self.condition.displaced(apply(seen.operator, end))
+        return Problem(frame, condition, seen, jnp.zeros_like(end), self.grid.elapsed)
 
     def observed(self) -> State:
         """The value that is observed; `ValueError` for a set."""
         require(self.condition.num_extra_noises == 0, "`condition` is a set, which has no observed value.")
-        return self._target(jnp.zeros((0,))).value
+        return self.condition.target(self.x0, jnp.ones(()), jnp.zeros((0,))).value
 
-    @full_precision
-    def _forecast(self, t, x: State, observed: State) -> tuple[GaussianMessage, State]:
-        """The guide's forecast of what is seen from x at the grid time at or below t, and what it adds to its score."""
-        seen, reference = self.end()
-        if not self._is_discrete:
-            auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
-            return exact_message(auxiliary, seen, t, self.ts[-1], x, observed), jnp.zeros_like(x)
-        plan = self.guide.plan(self.sde, seen, reference, self.ts)
-        k = GridNoise(ts=self.ts, noise=self.x0).index(t)
-        step = jax.tree.map(lambda a: a[k], plan.steps)
-        return plan.message(step, self.sde, self.ts[k], x, observed), plan.correction(step, x)
-
-    def _target(self, extra) -> Target:
-        seen = self.condition.observation(self.sde, self.x0)
-        if extra.shape[0] == 0:
-            return self.condition.target(self.x0, jnp.ones(()), extra)
-        message, _ = self._forecast(self.ts[0], self.x0, jnp.zeros_like(apply(seen.operator, self.x0)))
-        return self.condition.target(apply(message.operator, self.x0) + message.shift, message.factor, extra)
-
-    def _before_the_end(self, t, x) -> State:
-        """x, checked with t."""
+    def _before_the_end(self, t, x) -> tuple[Array, State]:
+        """The time that has elapsed at t, and x, checked."""
         x = as_float(x, "x")
         require(x.shape == self.x0.shape, f"`x` must be one state, {self.x0.shape}; got shape {x.shape}. Use vmap.")
+        elapsed = self.grid.since(t)
+        require(elapsed.ndim == 0, f"`t` must be one time; got shape {elapsed.shape}. Use vmap.")
         require(
-            jnp.all((t >= self.ts[0]) & (t < self.ts[-1])),
+            (elapsed >= 0) & (elapsed < self.grid.elapsed[-1]),
             f"`t` must lie in [{self.ts[0]}, {self.ts[-1]}), before the end; got {t}.",
         )
-        return x
+        return elapsed, x
 
     @_pure_method
     def log_h(self, t: RealScalar, x: State) -> Float[Array, ""]:
         """log h̃(t, x) of the guide, t before t1: log density of the datum, or log probability of the set, from x."""
-        x = self._before_the_end(t, x)
-        seen = self.condition.observation(self.sde, x)
-        message, _ = self._forecast(t, x, jnp.zeros_like(apply(seen.operator, x)))
-        return self.condition.log_value(apply(message.operator, x) + message.shift, message.factor) + seen.log_scale
+        return self._log_h_and_score(*self._before_the_end(t, x))[0]
 
     @_pure_method
     def score(self, t: RealScalar, x: State) -> State:
@@ -271,57 +291,144 @@ class GuidedBridge(eqx.Module):
 
         A learned guide's network is in it.
         """
-        x = self._before_the_end(t, x)
-        seen = self.condition.observation(self.sde, x)
-        message, correction = self._forecast(t, x, jnp.zeros_like(apply(seen.operator, x)))
+        return self._log_h_and_score(*self._before_the_end(t, x))[1]
+
+    @_pure_method
+    def scores(self, path: Float[Array, "K+1 n *dim"]) -> Float[Array, "K n *dim"]:
+        """∇ log h̃ at the grid times, the end left out, from the states of a path: one plan for all of them."""
+        return self._scores(path)
+
+    @eqx.filter_jit
+    @full_precision
+    def _log_h_and_score(self, since, x: State) -> tuple[Float[Array, ""], State]:
+        """The time is put into the grid behind t0; steps before it have no length and change nothing."""
+        problem = self.problem(x, since)
+        if not self._is_discrete:
+            return self._value_and_score(problem, None, None, since, problem.frame.start)
+        ts = jnp.concatenate([problem.ts[:1], jnp.maximum(problem.ts, since)])
+        plan = self.guide.plan(problem.frame.sde, problem.seen, problem.reference, ts)
+        entry = jax.tree.map(lambda a: a[1], plan.steps)
+        return self._value_and_score(problem, plan, entry, since, problem.frame.start)
+
+    @eqx.filter_jit
+    @full_precision
+    def _scores(self, path):
+        problem, ts = self.problem(), self.grid.elapsed[:-1]
+        y = path[:-1] - problem.frame.origins[:-1]
+        if not self._is_discrete:
+            return jax.vmap(lambda t, y: self._value_and_score(problem, None, None, t, y)[1])(ts, y)
+        plan = self.guide.plan(problem.frame.sde, problem.seen, problem.reference, problem.ts)
+        along = jax.vmap(lambda entry, t, y: self._value_and_score(problem, plan, entry, t, y)[1])
+        return along(plan.steps, ts, y)
+
+    def _message(self, problem: Problem, plan, entry, t, y: State) -> GaussianMessage:
+        """The guide's forecast of what is seen, a displacement, from y."""
+        frame, condition, seen, reference, ts = problem
+        blank = jnp.zeros_like(apply(seen.operator, y))
+        if plan is None:
+            auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
+            return exact_message(auxiliary, seen, t, ts[-1], y, blank)
+        return plan.message(entry, frame.sde, t, y, blank)
+
+    def _value_and_score(self, problem, plan, entry, t, y) -> tuple[Float[Array, ""], State]:
+        message = self._message(problem, plan, entry, t, y)
 
         def log_h(y):
-            return self.condition.log_value(apply(message.operator, y) + message.shift, message.factor)
+            return problem.condition.log_value(apply(message.operator, y) + message.shift, message.factor)
 
-        return jax.grad(log_h)(x) + correction
+        value, score = jax.value_and_grad(log_h)(y)
+        if plan is not None:
+            score = score + plan.correction(entry, y)
+        return value + problem.seen.log_scale, score
+
+    def _target(self, problem: Problem, plan, extra) -> Target:
+        start = problem.frame.start
+        if extra.shape[0] == 0:
+            return problem.condition.target(start, jnp.ones(()), extra)
+        message = self._start(problem, plan)
+        return problem.condition.target(apply(message.operator, start) + message.shift, message.factor, extra)
+
+    def _start(self, problem: Problem, plan) -> GaussianMessage:
+        """The forecast at t0."""
+        entry = None if plan is None else jax.tree.map(lambda a: a[0], plan.steps)
+        return self._message(problem, plan, entry, problem.ts[0], problem.frame.start)
+
+    def _plan(self, problem: Problem) -> AbstractPlan | None:
+        """`None` for a diffrax solver."""
+        if not self._is_discrete:
+            return None
+        return self.guide.plan(problem.frame.sde, problem.seen, problem.reference, problem.ts)
 
     @eqx.filter_jit
     @full_precision
     def _run(self, noise):
         extra, noise = self._split(noise)
-        seen, reference = self.end()
-        target = self._target(extra)
+        problem = self.problem()
+        frame, _, seen, reference, ts = problem
+        plan = self._plan(problem)
+        target = self._target(problem, plan, extra)
         v = target.value
-        if not self._is_discrete:
-            auxiliary = self.guide.auxiliary_process(self.sde, reference, self.ts[-1])
-            path, log_weight = travel_continuous(self.sde, auxiliary, self.solver, seen, self.ts, self.x0, noise, v)
+        if plan is None:
+            auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
+            path, log_weight = travel_continuous(frame.sde, auxiliary, self.solver, seen, ts, frame.start, noise, v)
         else:
-            plan = self.guide.plan(self.sde, seen, reference, self.ts)
-            path, x, log_weight = travel(self.sde, plan, self.ts, self.x0, noise[:-1], v)
-            end, log_density = arrive(self.sde, seen, self.ts, x, noise[-1], v)
+            path, y, log_weight = travel(frame.sde, plan, ts, frame.start, noise[:-1], v)
+            end, log_density = arrive(frame.sde, seen, ts, y, noise[-1], v)
             path, log_weight = jnp.concatenate([path, end[None]]), log_weight + log_density
+        path = frame.origins[1:] + path
+        if self.condition.exact:  # to the last digit
+            path = path.at[-1].set(self.condition.reference(self.sde, path[-1]))
         return jnp.concatenate([self.x0[None], path]), log_weight + target.log_weight
 
-    @eqx.filter_jit
-    @full_precision
     def noise_from_path(
         self, path: Float[Array, "K+1 n *dim"], key: PRNGKeyArray | None = None
     ) -> Float[Array, "K k dim"]:
         """The noise with `path(noise) = path`, for a path that starts at x0 and meets the condition.
 
         Where several noises give the same path (more noises than states, an exactly observed end) the part that the
-        path leaves free is drawn with `key`, from its law under the model; it is 0 without a key.
+        path leaves free is drawn with `key`, from its law under the model; it is 0 without a key. The path is given by
+        its states, whose digits limit those of the noise: in single precision, near an exact end, there may be few.
+
+        **Errors:** `ValueError` for a path that does not start at x0, or whose end is not the exact datum or outside
+        the set.
         """
         require(self._is_discrete, "`noise_from_path` needs the guided step: the default `solver`.")
         path = as_float(path, "path").astype(self.x0.dtype)
         shape = (self.num_steps + 1, *self.x0.shape)
         require(path.shape == shape, f"`path` must have shape {shape}; got {path.shape}.")
-        seen, reference = self.end()
-        plan = self.guide.plan(self.sde, seen, reference, self.ts)
-        if seen.exact:
-            observed = apply(seen.operator, path[-1])
-        else:
-            observed = self.observed()
-        z = retrace(self.sde, plan, seen, self.ts, path, observed, key)
-        if self.condition.num_extra_noises:
-            message, _ = self._forecast(self.ts[0], self.x0, jnp.zeros_like(observed))
-            mean = apply(message.operator, self.x0) + message.shift
-            row = self.condition.noise_from_target(mean, message.factor, observed)
+        self._check_ends(path)
+        return self._retrace(path, key)
+
+    def _check_ends(self, path):
+        """A path of another bridge has other ends. To single precision, in which it may have been kept."""
+        near = 1e-6 * jnp.max(jnp.abs(path))
+        start = jnp.max(jnp.abs(path[0] - self.x0))
+        require(
+            start <= near,
+            f"`path` must start at `x0`; its first state is {concrete(start)} away from it. Use the bridge from there.",
+        )
+        if self.condition.exact:
+            end = jnp.max(jnp.abs(path[-1] - self.condition.reference(self.sde, path[-1])))
+            require(
+                end <= near,
+                f"`path` must end where `condition` is met; its last state is {concrete(end)} away from there. Use the "
+                "bridge to what is seen of its end.",
+            )
+
+    @eqx.filter_jit
+    @full_precision
+    def _retrace(self, path, key):
+        problem = self.problem()
+        frame, condition, seen, _, ts = problem
+        plan = self._plan(problem)
+        assert plan is not None
+        y = (path - frame.origins).at[0].set(frame.start)
+        observed = apply(seen.operator, y[-1]) if seen.exact else self._target(problem, plan, jnp.zeros((0,))).value
+        z = retrace(frame.sde, plan, seen, ts, y, observed, key)
+        if condition.num_extra_noises:
+            message = self._start(problem, plan)
+            mean = apply(message.operator, frame.start) + message.shift
+            row = condition.noise_from_target(mean, message.factor, observed)
             row = jnp.pad(row, [(0, 0), (0, z.shape[1] - row.shape[1])] + [(0, 0)] * (z.ndim - 2))
             z = jnp.concatenate([row, z])
         return z.reshape(self.noise_shape)

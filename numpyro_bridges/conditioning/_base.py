@@ -78,6 +78,43 @@ class AbstractCondition(eqx.Module):
         """The extra noise with which `target` chooses `seen`."""
 
 
+    def displaced(self, shift: State) -> "AbstractCondition":
+        """The condition on what is seen less `shift`; here by adding it again, which costs digits."""
+        return _Displaced(self, shift)
+
+
+class _Displaced(AbstractCondition):
+    condition: AbstractCondition
+    shift: State
+
+    @property
+    def num_extra_noises(self):
+        return self.condition.num_extra_noises
+
+    @property
+    def exact(self):
+        return self.condition.exact
+
+    def check(self, sde, x):
+        self.condition.check(sde, x)
+
+    def observation(self, sde, x):
+        return self.condition.observation(sde, x)
+
+    def reference(self, sde, x):
+        return self.condition.reference(sde, x)
+
+    def log_value(self, law_mean, law_factor):
+        return self.condition.log_value(law_mean + self.shift, law_factor)
+
+    def target(self, law_mean, law_factor, noise):
+        target = self.condition.target(law_mean + self.shift, law_factor, noise)
+        return Target(target.value - self.shift, target.log_weight)
+
+    def noise_from_target(self, law_mean, law_factor, seen):
+        return self.condition.noise_from_target(law_mean + self.shift, law_factor, seen + self.shift)
+
+
 class AbstractMatch(eqx.Module):
     """A model of observation of the end state."""
 
@@ -101,4 +138,7 @@ def lift(operator: Structured, x: State, value: State) -> State:
     if operator.ndim == 1:
         d = operator if x.ndim == 1 else operator[:, None]
         return jnp.where(d == 0, x, value / jnp.where(d == 0, 1, d))
-    return x + jnp.linalg.pinv(operator) @ (value - apply(operator, x))
+    inverse = jnp.linalg.pinv(operator)
+    for _ in range(2):  # the second time to the last digit
+        x = x + inverse @ (value - apply(operator, x))
+    return x

@@ -95,6 +95,12 @@ class CylinderSet(AbstractCondition):
         low, high = self.lower.astype(x.dtype), self.upper.astype(x.dtype)
         return lift(self.observation(sde, x).operator, x, jnp.clip(x[np.array(self.rows)], low, high))
 
+    def displaced(self, shift):
+        def bounds(box):
+            return box.lower, box.upper
+
+        return eqx.tree_at(bounds, self, (self.lower - shift, self.upper - shift))
+
     def _bounds(self, like: State) -> tuple[State, State, State, Array]:
         """Both bounds and the lost width in the precision of a state, and which coordinates are pinned."""
         lower, upper, lost = (a.astype(like.dtype) for a in (self.lower, self.upper, self.lost))

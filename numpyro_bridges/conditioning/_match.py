@@ -65,6 +65,9 @@ class _Seen(AbstractCondition):
     def reference(self, sde, x):
         return lift(self.observation(sde, x).operator, x, self.observed)
 
+    def displaced(self, shift):
+        return _Seen(match=self.match, observed=self.observed - shift)
+
     def log_value(self, law_mean, law_factor):
         return whitened_log_density(solve_lower(law_factor, self.observed - law_mean), law_factor)
 

@@ -19,8 +19,8 @@ from .._checks import as_float, concrete, require, require_finite, require_insta
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractMatch
-from ..guiding import AbstractGuide, time_grid
-from ..sdes import AbstractSDE, simulate
+from ..guiding import AbstractGuide
+from ..sdes import AbstractSDE, simulate, time_grid
 from ._batch import as_datum, as_shape, find_batched, one_of
 from ._noise_driven import AbstractNoiseDriven
 
@@ -57,7 +57,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         *,
         t1: RealScalar | None = None,
         num_steps: int | None = None,
-        t0: RealScalar = 0.0,
+        t0: RealScalar | None = None,
         ts=None,
         guide: AbstractGuide | None = None,
         batch_shape: tuple[int, ...] = (),
@@ -194,9 +194,9 @@ def _path(parts, value, noise):
 
 
 def _free_path(parts, key):
-    sde, x0, ts = parts["sde"], parts["x0"], parts["ts"]
-    shape = (len(ts) - 1, sde.noise_size(x0), x0.shape[1] if x0.ndim == 2 else 1)
-    return simulate(sde, x0, ts, jr.normal(key, shape, x0.dtype))
+    sde, x0, grid = parts["sde"], parts["x0"], parts["ts"]
+    shape = (grid.num_steps, sde.noise_size(x0), x0.shape[1] if x0.ndim == 2 else 1)
+    return simulate(sde, x0, grid, jr.normal(key, shape, x0.dtype))
 
 
 def _seen(parts):

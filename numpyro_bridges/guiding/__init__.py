@@ -6,7 +6,6 @@ from ._continuous import (
     weight_rate as weight_rate,
 )
 from ._edge import arrive as arrive, retrace as retrace, travel as travel
-from ._grid import time_grid as time_grid
 from ._guides import (
     AbstractGuide as AbstractGuide,
     AbstractPlan as AbstractPlan,

@@ -21,7 +21,7 @@ from .._checks import as_float, require, require_instance
 from .._linalg import add, apply, cholesky, compose, congruence, promote, varying_like
 from .._types import RealScalar, State, Structured
 from ..conditioning import GaussianMessage, Observation
-from ..sdes import AbstractSDE, AffineStep, BrownianMotion, LinearSDE, Transition
+from ..sdes import AbstractSDE, AffineStep, BrownianMotion, Displaced, LinearSDE, Transition
 from ._steering import AbstractSteering, DriftSteering, GaussianSteering
 
 _MAX_DENSE = 16
@@ -50,14 +50,29 @@ class AbstractGuide(eqx.Module):
     """A way to lead paths to what is observed."""
 
     @abc.abstractmethod
-    def plan(self, sde: AbstractSDE, seen: Observation, reference: State, ts) -> AbstractPlan:
-        """Prepare for a grid `ts` `(K + 1,)`. `reference` is a state that meets the condition."""
+    def plan(self, sde: Displaced, seen: Observation, reference: State, ts) -> AbstractPlan:
+        """Prepare for a grid.
+
+        **Arguments:** `sde`: the process of displacements y = x − `sde.origin`, in the time that has elapsed, of the
+        SDE `sde.sde`. `reference`: the displacement of a state that meets the condition, 0. `ts` `(K + 1,)`: times
+        that have elapsed. What is observed is a displacement too, of L x from L `sde.origin`.
+
+        States that a guide holds are put into place by `state - sde.origin`, other SDEs by `sde.alongside(other)`.
+        """
+
+    @property
+    def moves(self) -> bool:
+        """Whether it may be asked to plan for displacements from a moving origin, whose `sde` has no `origin`.
+
+        So if it holds no states, and no process but the SDE's own.
+        """
+        return False
 
     def check(self, sde: AbstractSDE, x: State) -> None:
         """`ValueError` where the guide does not fit states shaped like x."""
         return None
 
-    def auxiliary_process(self, sde: AbstractSDE, reference: State, t1: RealScalar) -> LinearSDE:
+    def auxiliary_process(self, sde: Displaced, reference: State, t1: RealScalar) -> LinearSDE:
         """The linear process whose h̃ is an exact h-transform, for the continuous-time weight."""
         raise ValueError(
             "the continuous weight (a diffrax `solver`) needs a guide with one auxiliary process, since it weighs the "
@@ -104,6 +119,10 @@ class FrozenGuide(AbstractGuide):
             except ValueError as e:
                 raise ValueError(f"`auxiliary` must have the states of the SDE, {x.shape}: {e}") from e
 
+    @property
+    def moves(self):
+        return self.auxiliary is None
+
     def plan(self, sde, seen, reference, ts):
         return _FrozenPlan(backward_filter(self._steps(sde, reference, ts), seen))
 
@@ -113,7 +132,7 @@ class FrozenGuide(AbstractGuide):
         return jax.vmap(lambda s, t: sde.auxiliary_step(self.auxiliary, s, t, reference))(ts[:-1], ts[1:])
 
     def auxiliary_process(self, sde, reference, t1):
-        process = sde if self.auxiliary is None else self.auxiliary
+        process = sde if self.auxiliary is None else sde.alongside(self.auxiliary)
         B, beta = process.linearised_drift(t1, reference)
         return LinearSDE(B, process.diffusion(t1, reference), beta)
 
@@ -158,6 +177,10 @@ class RecedingGuide(AbstractGuide):
             f"`end_weight` must be a number from 0 to 1; got {end_weight}.",
         )
 
+    @property
+    def moves(self):
+        return True
+
     def plan(self, sde, seen, reference, ts):
         if sde.has_constant_covariance(reference):
             return FrozenGuide().plan(sde, seen, reference, ts)
@@ -200,6 +223,10 @@ class DriftGuide(AbstractGuide):
 
     def check(self, sde, x):
         self.guide.check(sde, x)
+
+    @property
+    def moves(self):
+        return self.guide.moves
 
     def plan(self, sde, seen, reference, ts):
         plan = self.guide.plan(sde, seen, reference, ts)

@@ -121,9 +121,10 @@ class ScoreGuide(AbstractGuide):
         pooled = isinstance(sde.space, Landmarks)
         theta = jnp.zeros(0, dtype)
         if self.context is not None:
-            theta = (self.context(sde) - self.standard.context_mean) / self.standard.context_scale
+            theta = (self.context(sde.sde) - self.standard.context_mean) / self.standard.context_scale
         v = reference.reshape(n, -1)
-        inputs = v, self.standard.target(v, pooled), theta
+        target = self.standard.target(v + sde.origin.reshape(v.shape), pooled)
+        inputs = v, target, theta
         return ScorePlan((base.steps, ts[-1] - ts[:-1]), base, self.network, self.held, self.standard, unit, inputs)
 
 
@@ -167,16 +168,17 @@ class Unguided(AbstractGuide):
     """No guide, h̃ = 1: paths of the SDE itself, weighted by the density of what is seen."""
 
     def plan(self, sde, seen, reference, ts):
-        return _UnguidedPlan(ts[:-1], 0 * seen.operator)
+        return _UnguidedPlan(ts[:-1], 0 * seen.operator, -apply(seen.operator, sde.origin))
 
 
 class _UnguidedPlan(AbstractPlan):
     steps: Float[Array, " K"]
     operator: Structured
+    shift: State
 
     def steer(self, step, transition, dt, x, observed):
         return DriftSteering(jnp.zeros_like(apply(transpose(transition.factor), x)))
 
     def message(self, step, sde, t, x, observed):
         one = jnp.ones((), x.dtype)
-        return GaussianMessage(self.operator, jnp.zeros_like(observed), one, observed, 0 * one)
+        return GaussianMessage(self.operator, self.shift, one, observed, 0 * one)

@@ -81,7 +81,7 @@ class _Row:
         space = bridge.sde.space
         to_points = (lambda x: x) if space is None else space.to_points
         self.times = np.asarray(bridge.ts)[chosen]
-        drifts = _guiding_drift(bridge, bridge.ts[chosen], states[chosen])
+        drifts = _guiding_drift(bridge, states)[chosen]
         self.drifts = np.asarray(jax.vmap(to_points)(drifts), dtype=float)
         if not np.isfinite(self.drifts).all():
             raise ValueError("`paths` must lead to finite drifts a(t, x) ∇ log h̃(t, x); got NaN or infinite ones.")
@@ -125,11 +125,11 @@ def _chosen(bridge: GuidedBridge, times: ArrayLike) -> NDArray:
 
 
 @eqx.filter_jit
-def _guiding_drift(bridge: GuidedBridge, times, states):
-    def one(t, x):
-        return apply(bridge.sde.covariance(t, x), bridge.score(t, x))
+def _guiding_drift(bridge: GuidedBridge, path):
+    def one(t, x, score):
+        return apply(bridge.sde.covariance(t, x), score)
 
-    return jax.vmap(one)(times, states)
+    return jax.vmap(one)(bridge.shown_ts[:-1], path[:-1], bridge.scores(path))
 
 
 def _canvas(num_rows: int, num_columns: int, corners: NDArray) -> tuple[Any, Any]:

@@ -41,7 +41,7 @@ class Cloud(eqx.Module):
 def adjoint_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None) -> Cloud:
     """h(t, ·) of a bridge: the reversed process from what is observed, weighted by exp ∫ c."""
     key_start, key = jr.split(key)
-    reverse = ReversedSDE(bridge.sde, bridge.ts[0] + bridge.ts[-1])
+    reverse = ReversedSDE(bridge.sde, bridge.shown_ts[-1])
     seen, v = bridge.end()
     start = jnp.broadcast_to(v, (size, *v.shape))
     factor = seen.factor
@@ -114,9 +114,10 @@ def forward_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None) 
 
 def reversed_bridge(bridge: GuidedBridge, end: State, guide: AbstractGuide | None = None) -> GuidedBridge:
     """The reversed process from the end of a bridge, conditioned on x0, on the mirrored grid."""
-    clock = bridge.ts[0] + bridge.ts[-1]
+    shown, elapsed = bridge.shown_ts, bridge.grid.elapsed
+    reverse = ReversedSDE(bridge.sde, shown[-1])
     match = ExactMatch().at(bridge.x0)
-    return GuidedBridge(ReversedSDE(bridge.sde, clock), match, x0=end, ts=clock - bridge.ts[::-1], guide=guide)
+    return GuidedBridge(reverse, match, x0=end, ts=elapsed[-1] - elapsed[::-1], guide=guide)
 
 
 def log_density(transition: Transition, y: State) -> Float[Array, ""]:
@@ -165,7 +166,7 @@ def _cloud(bridge, key, y, advance, log_pair, log_weight, rho, given=None) -> Cl
         chosen = jnp.where(poor, _systematic(key_resample, weights), jnp.arange(size))
         return (new[chosen], g[chosen], jnp.where(poor, 0.0, logits)), Cloud(new, g, weights, rho)
 
-    ts = bridge.ts
+    ts = bridge.shown_ts
     entries = (ts[:-1], ts[1:], jr.split(key, bridge.num_steps), moves, rho, given)
     return jax.lax.scan(step, (y, g, jnp.zeros(size, y.dtype)), entries, reverse=True)[1]
 

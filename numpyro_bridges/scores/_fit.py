@@ -20,7 +20,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from .. import weights
 from .._checks import as_path, choice, concrete, flag, require, require_instance, require_key, words
-from .._linalg import full_precision
+from .._linalg import apply, full_precision
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractCondition
@@ -53,7 +53,7 @@ def fit(
     t1: RealScalar | None = None,
     key: PRNGKeyArray,
     method: str = "residual",
-    t0: RealScalar = 0.0,
+    t0: RealScalar | None = None,
     num_steps: int | None = None,
     ts=None,
     guide: AbstractGuide | None = None,
@@ -115,7 +115,7 @@ def fit(
         if draw is None:
             return bridge
         sde, condition, x0 = draw(key)
-        return GuidedBridge(sde, condition, x0=x0, ts=bridge.ts, guide=bridge.guide)
+        return GuidedBridge(sde, condition, x0=x0, ts=bridge.grid, guide=bridge.guide)
 
     if network is None:
         size = 0 if context is None else context(sde).shape[0]
@@ -227,7 +227,7 @@ def _linearised(bridge: GuidedBridge) -> AbstractGuide:
 
 def _driftless(bridge: GuidedBridge) -> AbstractGuide:
     """Better than the linearised one where the drift turns within the reach of the paths."""
-    return FrozenGuide(BrownianMotion(bridge.sde.covariance(bridge.ts[0], bridge.x0)))
+    return FrozenGuide(BrownianMotion(bridge.sde.covariance(bridge.clock, bridge.x0)))
 
 
 METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
@@ -278,25 +278,26 @@ def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
         key_draw, key_cloud = jr.split(key)
         bridge = problem.draw(key_draw)
         cloud = make(bridge, key_cloud, -(-size // draws), rho)
-        seen, reference = bridge.end()
-        plan = replace(problem.guide, network=network).plan(bridge.sde, seen, reference, bridge.ts)
-        observed = bridge.observed()
+        frame, condition, seen, reference, ts = bridge.with_guide(problem.guide).problem()
+        plan = replace(problem.guide, network=network).plan(frame.sde, seen, reference, ts)
+        observed = bridge.observed() - apply(seen.operator, frame.origins[-1])
+        displacements = cloud.x - frame.origins[:-1, None]
 
         def lacking(step, t, x, g):
-            base = plan.base.message(step[0], bridge.sde, t, x, observed).score(x)
+            base = plan.base.message(step[0], frame.sde, t, x, observed).score(x)
             return g - base - plan.base.correction(step[0], x)
 
         each = jax.vmap(jax.vmap(lacking, (None, None, 0, 0)))
-        target = each(plan.steps, bridge.ts[:-1], cloud.x, cloud.score)
+        target = each(plan.steps, ts[:-1], displacements, cloud.score)
         each_inputs = jax.vmap(plan.inputs, (None, 0), ROWWISE)
-        inputs = jax.vmap(each_inputs, (0, 0), ROWWISE)(plan.steps[1], cloud.x)
+        inputs = jax.vmap(each_inputs, (0, 0), ROWWISE)(plan.steps[1], displacements)
 
         def error(output):
             def one(t, x, f, target):
                 return jnp.sum(whiten(bridge, t, x, plan.score(f, x) - target) ** 2)
 
-            squares = jax.vmap(jax.vmap(one, (None, 0, 0, 0)))(bridge.ts[:-1], cloud.x, output, target)
-            dt = jnp.diff(bridge.ts)
+            squares = jax.vmap(jax.vmap(one, (None, 0, 0, 0)))(bridge.shown_ts[:-1], cloud.x, output, target)
+            dt = jnp.diff(ts)
             return jnp.sum(dt[:, None] * cloud.weights * squares) / jnp.sum(dt)
 
         return inputs, error
@@ -361,7 +362,7 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> Scor
 
     paths, v, theta = jax.jit(jax.vmap(one))(jr.split(key, num_paths))
     bridge = draw(key)
-    duration = bridge.ts[-1] - bridge.ts[0]
+    duration = bridge.grid.elapsed[-1]
     pooled = isinstance(bridge.sde.space, Landmarks)
     away = jnp.mean((paths - v[:, None]) ** 2, axis=(0, 1))
     if pooled:
@@ -380,7 +381,7 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> Scor
 
 
 def _need_noise(bridge: GuidedBridge, method: str) -> None:
-    a = bridge.sde.covariance(bridge.ts[0], bridge.x0)
+    a = bridge.sde.covariance(bridge.clock, bridge.x0)
     if concrete(a) is not None:
         pivots = jnp.diagonal(jnp.linalg.cholesky(a)) if a.ndim == 2 else jnp.atleast_1d(a)
         require(

@@ -1,6 +1,6 @@
 """The process that runs backwards.
 
-With time τ = t0 + t1 − t the reversed process has the drift −b + div a and the diffusion of the SDE. A solution h of
+With time τ = t1 − t the reversed process has the drift −b + div a and the diffusion of the SDE. A solution h of
 the backward equation, read in τ, is its density weighted by exp ∫ c,
 
     c = ½ ∇·div a − ∇·b,
@@ -18,7 +18,7 @@ from ..spaces import AbstractSpace
 
 
 class ReversedSDE(AbstractSDE):
-    """dY = (−b + div a)(clock − τ, Y) dτ + σ(clock − τ, Y) dW, with clock = t0 + t1."""
+    """dY = (−b + div a)(clock − τ, Y) dτ + σ(clock − τ, Y) dW, with clock the time at which it starts, t1."""
 
     sde: AbstractSDE
     clock: Float[Array, ""]

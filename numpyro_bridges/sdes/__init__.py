@@ -1,10 +1,13 @@
 from ._base import (
     AbstractSDE as AbstractSDE,
     AffineStep as AffineStep,
+    Displaced as Displaced,
+    Frame as Frame,
     Transition as Transition,
     divergence as divergence,
-    simulate as simulate,
+    still_frame as still_frame,
 )
+from ._grid import TimeGrid as TimeGrid, time_grid as time_grid
 from ._kunita import KunitaFlow as KunitaFlow
 from ._linear import BrownianMotion as BrownianMotion, LinearSDE as LinearSDE
 from ._noise import (
@@ -14,3 +17,4 @@ from ._noise import (
     SpectralNoise as SpectralNoise,
 )
 from ._sde import SDE as SDE
+from ._simulate import simulate as simulate

@@ -5,16 +5,18 @@ States are `(n, dim)` or `(n,)`; σ acts on the first axis, so a = σσᵀ is n 
 
 import abc
 from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Literal
 from jaxtyping import Array, Float
 
-from .._checks import floating, require
-from .._linalg import add, apply, columns, full_precision, promote, varying_like
-from .._types import Noise, RealScalar, State, Structured
+from .._linalg import add, apply, promote
+from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
 
 _MAX_LINEARISED = 64
@@ -22,11 +24,21 @@ _MAX_LINEARISED = 64
 
 
 class Transition(eqx.Module):
-    """One step of the time-discretised model, x' = mean + factor u with u ~ N(0, I), covariance = factor factorᵀ."""
+    """One step of the time-discretised model, x' = start + increment + factor u with u ~ N(0, I).
 
-    mean: State
+    `covariance` is factor factorᵀ. The increment is held, and not the mean, since a step may be short beside the state:
+    bridges add it to what is left of the way to the observed end.
+    """
+
+    start: State
+    increment: State
     factor: Structured
     covariance: Structured
+
+    @property
+    def mean(self) -> State:
+        """start + increment."""
+        return self.start + self.increment
 
 
 class AffineStep(eqx.Module):
@@ -71,6 +83,14 @@ class AbstractSDE(eqx.Module):
     def has_constant_covariance(self, x: State) -> bool:
         """Whether a(t, x) is known not to depend on x; decides the default guide."""
 
+    def is_autonomous(self, x: State) -> bool:
+        """Whether b and σ are known not to depend on t; such an SDE is shown the time that has elapsed since t0."""
+        return not depends_on(lambda t: (self.drift(t, x), self.noise(t, x)), jnp.zeros(()))
+
+    def frame(self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar) -> "Frame":
+        """Displacements from `end`. An SDE whose noise-free path is known may let the origin move along it."""
+        return still_frame(self, x0, end, elapsed, clock)
+
     def diffusion(self, t: RealScalar, x: State) -> Structured:
         """σ(t, x)."""
         return self.noise(t, x)[0]
@@ -101,7 +121,13 @@ class AbstractSDE(eqx.Module):
         """The model's step from t0 to t1; Euler–Maruyama unless the class has its exact law."""
         dt = t1 - t0
         factor, covariance = self.noise(t0, x)
-        return Transition(x + dt * self.drift(t0, x), jnp.sqrt(dt) * factor, dt * covariance)
+        return Transition(x, dt * self.drift(t0, x), jnp.sqrt(dt) * factor, dt * covariance)
+
+    def transition_from(
+        self, origin: State, t0: RealScalar, t1: RealScalar, y: State
+    ) -> Transition:
+        """The step of the displacement y = x − origin."""
+        return replace(self.transition(t0, t1, origin + y), start=y)
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         """B and β with b(t, y) ≈ B y + β near x; B = 0 for states of more than 64 numbers.
@@ -154,35 +180,91 @@ class AbstractSDE(eqx.Module):
             )
 
 
-@full_precision
-def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
-    """A path of the model, unconditioned.
+class Frame(NamedTuple):
+    """Displacements y = x − o(t) from a path o that ends where the end state is to be."""
 
-    **Arguments:** `x0` `(n, dim)`; `ts` `(K + 1,)`; `noise` `(K, k, dim)`, standard normal.
+    sde: AbstractSDE
+    """Of y, in the time that has elapsed."""
+    origins: Float[Array, "K+1 n *dim"]
+    """o at the grid times, the last being the state that meets the condition."""
+    start: State
+    """y at t0."""
 
-    **Returns:** `(K + 1, n, dim)`, the first state being `x0`.
+
+class Displaced(AbstractSDE):
+    """The process Y = X − origin of an SDE, in the time that has elapsed: `clock` is added to it before `sde` is asked.
+
+    y keeps its digits where it is small beside x; x = origin + y is formed only to evaluate b and σ there.
     """
-    x0, ts = floating(x0, "x0"), floating(ts, "ts")
-    sde.check_state(x0)
-    require(ts.ndim == 1 and ts.size >= 2, f"`ts` must be a vector of at least two times; got shape {ts.shape}.")
-    require(jnp.all(jnp.diff(ts) > 0), "`ts` must increase strictly. Sort it and remove repeated times.")
-    shape = (ts.shape[0] - 1, sde.noise_size(x0), columns(x0))
-    allowed = (shape, shape[:2]) if x0.ndim == 1 else (shape,)
-    require(
-        jnp.shape(noise) in allowed,
-        f"`noise` must have shape {shape}, one row per step; got {jnp.shape(noise)}. Use vmap for a batch.",
-    )
-    noise = jnp.asarray(noise)
 
-    def step(x, inputs):
-        t0, t1, z = inputs
-        law = sde.transition(t0, t1, x)
-        x = law.mean + apply(law.factor, z.reshape(z.shape[: x.ndim]))
-        return x, x
+    sde: AbstractSDE
+    origin: State
+    clock: Float[Array, ""]
 
-    start = varying_like(x0, sde, ts, noise)
-    _, path = jax.lax.scan(step, start, (ts[:-1], ts[1:], noise))
-    return jnp.concatenate([x0[None], path])
+    @property
+    def space(self) -> AbstractSpace | None:
+        return self.sde.space
+
+    def alongside(self, other: AbstractSDE) -> "Displaced":
+        """Another SDE, seen from the same origin."""
+        return Displaced(other, self.origin, self.clock)
+
+    def drift(self, t: RealScalar, x: State) -> State:
+        return self.sde.drift(self.clock + t, self.origin + x)
+
+    def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
+        return self.sde.noise(self.clock + t, self.origin + x)
+
+    def has_constant_covariance(self, x: State) -> bool:
+        return self.sde.has_constant_covariance(self.origin + x)
+
+    def is_autonomous(self, x: State) -> bool:
+        return self.sde.is_autonomous(self.origin + x)
+
+    def ito_is_stratonovich(self, x: State) -> bool:
+        return self.sde.ito_is_stratonovich(self.origin + x)
+
+    def noise_size(self, x: State) -> int:
+        return self.sde.noise_size(self.origin + x)
+
+    def check_state(self, x: State) -> None:
+        self.sde.check_state(self.origin + x)
+
+    def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
+        return self.sde.transition_from(self.origin, self.clock + t0, self.clock + t1, x)
+
+    def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
+        B, _ = self.sde.linearised_drift(self.clock + t, self.origin + x)
+        return B, self.drift(t, x) - apply(B, x)
+
+    def linearised_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        """Tangent to `transition` at x, whose increment has digits that the shift of X has lost."""
+        step = self.sde.linearised_step(self.clock + t0, self.clock + t1, self.origin + x)
+        shift = self.transition(t0, t1, x).mean - apply(step.operator, x)
+        return AffineStep(step.operator, shift, step.covariance)
+
+    def auxiliary_step(
+        self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State
+    ) -> AffineStep:
+        return self.sde.auxiliary_step(self.alongside(auxiliary), t0, t1, x)
+
+
+def still_frame(
+    sde: AbstractSDE, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar
+) -> Frame:
+    """Displacements from `end`, at all times."""
+    origins = jnp.broadcast_to(end, (elapsed.shape[0], *end.shape))
+    return Frame(Displaced(sde, end, jnp.asarray(clock)), origins, x0 - end)
+
+
+def depends_on(f: Callable, x: Array) -> bool:
+    """Whether f(x) is computed from x, by following x through the traced program (a `True` may be over-cautious)."""
+    jaxpr = jax.make_jaxpr(f)(x).jaxpr
+    reached = set(jaxpr.invars)
+    for eqn in jaxpr.eqns:
+        if any(not isinstance(v, Literal) and v in reached for v in eqn.invars):
+            reached.update(eqn.outvars)
+    return any(not isinstance(v, Literal) and v in reached for v in jaxpr.outvars)
 
 
 def divergence(field: Callable, x: State) -> Float[Array, ""]:

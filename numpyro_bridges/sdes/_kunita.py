@@ -105,6 +105,9 @@ class KunitaFlow(AbstractSDE):
     def has_constant_covariance(self, x: State) -> bool:
         return False
 
+    def is_autonomous(self, x: State) -> bool:
+        return True
+
     def ito_is_stratonovich(self, x: State) -> bool:
         return self.noise_field.fixed_in_space
 

@@ -7,15 +7,16 @@ The integrals are elementwise for a scalar or diagonal B, and by series and doub
 
 from math import factorial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import as_float, concrete, require, require_finite
-from .._linalg import apply, cholesky, compose, congruence, promote, symmetric, transpose, varying_like
+from .._linalg import add, apply, cholesky, compose, congruence, promote, symmetric, transpose, varying_like
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
-from ._base import AbstractSDE, AffineStep, Transition, as_state_shift
+from ._base import AbstractSDE, AffineStep, Frame, Transition, as_state_shift
 
 _TERMS, _DOUBLINGS = 22, 20
 """Of the series, at a norm of at most 1, and of the step: B dt up to 2^20."""
@@ -35,7 +36,7 @@ def _phi1(x: Array) -> Array:
 
 
 def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array, Array, Array]:
-    """e^{Bτ}, ∫₀^τ e^{Bu} β du and ∫₀^τ e^{Bu} a e^{Bᵀu} du at τ = dt: Taylor series at dt/2^k, then k doublings.
+    """e^{Bτ} − 1, ∫₀^τ e^{Bu} β du and ∫₀^τ e^{Bu} a e^{Bᵀu} du at τ = dt: Taylor series at dt/2^k, then k doublings.
 
     The block exponential of Van Loan (1978) holds e^{−Bτ} beside e^{Bτ} and loses the covariance of a stiff equation to
     cancellation, 0.1 at Bτ = 40; a doubling is a sum of covariances. To double e^{Bτ} − 1 keeps the digits that e^{Bτ}
@@ -54,8 +55,7 @@ def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array
         E, shift, S = totals
         return (power, term, terms, (E + power, shift + term, S + terms)), None
 
-    identity = jnp.eye(B.shape[0], dtype=B.dtype)
-    start = (identity, beta, a, (jnp.zeros_like(B), beta, a))
+    start = (jnp.eye(B.shape[0], dtype=B.dtype), beta, a, (jnp.zeros_like(B), beta, a))
     start = varying_like(start, B, beta, a, dt)
     (*_, totals), _ = jax.lax.scan(series, start, jnp.arange(1, _TERMS + 1, dtype=B.dtype))
 
@@ -66,7 +66,7 @@ def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array
         return jax.tree.map(lambda new, old: jnp.where(i < k, new, old), doubled, totals), None
 
     (E, shift, S), _ = jax.lax.scan(double, totals, jnp.arange(_DOUBLINGS, dtype=B.dtype))
-    return jax.tree.map(lambda x: jnp.where(k <= _DOUBLINGS, x, jnp.nan), (identity + E, shift, S))
+    return jax.tree.map(lambda x: jnp.where(k <= _DOUBLINGS, x, jnp.nan), (E, shift, S))
 
 
 def _psd_cholesky(S: Structured) -> Structured:
@@ -105,6 +105,9 @@ class BrownianMotion(AbstractSDE):
         return jnp.zeros((), x.dtype), jnp.zeros_like(x)
 
     def has_constant_covariance(self, x: State) -> bool:
+        return True
+
+    def is_autonomous(self, x: State) -> bool:
         return True
 
 
@@ -173,32 +176,65 @@ class LinearSDE(AbstractSDE):
     def has_constant_covariance(self, x: State) -> bool:
         return True
 
-    def exact_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
-        """The exact affine Gaussian law of X at t1 given X at t0, for states shaped like x."""
-        dt = t1 - t0
+    def is_autonomous(self, x: State) -> bool:
+        return True
+
+    def _flow(self, dt: RealScalar, x: State) -> tuple[Structured, State, Structured]:
+        """e^{B dt} − 1, ∫ e^{Bu} β du and the covariance."""
         B, sigma, beta = self.drift_operator, self.diffusion_operator, as_state_shift(self.shift, x)
         a = compose(sigma, transpose(sigma))
         if B.ndim < 2:
             rate = B if a.ndim < 2 or B.ndim == 0 else 0.5 * (B[:, None] + B[None, :])
             mean_map = dt * _phi1(dt * B)
-            if B.ndim == 1 and x.ndim == 2:
-                mean_map = mean_map[:, None]
-            return AffineStep(jnp.exp(dt * B), mean_map * beta, dt * _phi1(2 * dt * rate) * a)
+            return mean_map * B, apply(mean_map, beta), dt * _phi1(2 * dt * rate) * a
         a = promote(a, 2, B.shape[0])
-        operator, shift, S = _affine_flow(B, beta if beta.ndim == 2 else beta[:, None], a, dt)
-        return AffineStep(operator, shift.reshape(beta.shape), 0.5 * (S + S.T))
+        growth, shift, S = _affine_flow(B, beta if beta.ndim == 2 else beta[:, None], a, dt)
+        return growth, shift.reshape(beta.shape), 0.5 * (S + S.T)
+
+    def exact_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        """The exact affine Gaussian law of X at t1 given X at t0, for states shaped like x."""
+        growth, shift, S = self._flow(t1 - t0, x)
+        return AffineStep(add(jnp.ones((), x.dtype), growth), shift, S)
 
     def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
-        step = self.exact_step(t0, t1, x)
-        mean = apply(step.operator, x) + step.shift
+        dt = t1 - t0
+        growth, shift, S = self._flow(dt, x)
+        increment = apply(growth, x) + shift
         B, sigma = self.drift_operator, self.diffusion_operator
         if B.ndim == 0 or (B.ndim == 1 and sigma.ndim < 2):
             # σ times a positive number, smooth also where σ is 0, as a root of σ² is not
-            dt = t1 - t0
             factor = compose(jnp.sqrt(dt * _phi1(2 * dt * B)), sigma)
-            return Transition(mean, factor, step.covariance)
-        factor = _psd_cholesky(step.covariance)
-        return Transition(mean, factor, congruence(factor, jnp.ones((), x.dtype)))
+            return Transition(x, increment, factor, S)
+        factor = _psd_cholesky(S)
+        return Transition(x, increment, factor, congruence(factor, jnp.ones((), x.dtype)))
+
+    def _displaced(self, drift: State) -> "LinearSDE":
+        """The process seen from an origin where it has this drift."""
+        return eqx.tree_at(lambda sde: sde.shift, self, drift)
+
+    def transition_from(
+        self, origin: State, t0: RealScalar, t1: RealScalar, y: State
+    ) -> Transition:
+        return self._displaced(self.drift(t0, origin)).transition(t0, t1, y)
+
+    def frame(self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar) -> Frame:
+        """Displacements from the noise-free path, moved so that it ends at `end`: they are as small as the noise.
+
+        From `end` itself where that is nearer to the start: the noise-free path of an unstable equation may be far
+        from where it is conditioned to go.
+        """
+
+        def noise_free(t):
+            growth, shift, _ = self._flow(t, x0)
+            return x0 + apply(growth, x0) + shift
+
+        distance = jnp.max(jnp.abs(jax.lax.stop_gradient(end - noise_free(elapsed[-1]))))
+        moves = distance <= jnp.max(jnp.abs(end - x0))  # False of NaN too
+        times = jnp.where(moves, elapsed, 0.0)
+        gap = end - noise_free(times[-1])
+        drift = jnp.where(moves, apply(self.drift_operator, gap), self.drift(clock, end))
+        origins = jax.vmap(noise_free)(times[:-1]) + gap[None]
+        return Frame(self._displaced(drift), jnp.concatenate([origins, end[None]]), -gap)
 
     def linearised_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
         return self.exact_step(t0, t1, x)

@@ -8,13 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jax.extend.core import Literal
 
 from .._checks import require
 from .._linalg import compose, transpose
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
-from ._base import AbstractSDE
+from ._base import AbstractSDE, depends_on
 
 
 class _Static(eqx.Module):
@@ -99,13 +98,3 @@ def _takes_three(f: Callable) -> bool:
     except ValueError:  # it does not tell
         pass
     return True
-
-
-def depends_on(f: Callable, x: State) -> bool:
-    """Whether f(x) is computed from x, by following x through the traced program (a `True` may be over-cautious)."""
-    jaxpr = jax.make_jaxpr(f)(x).jaxpr
-    reached = set(jaxpr.invars)
-    for eqn in jaxpr.eqns:
-        if any(not isinstance(v, Literal) and v in reached for v in eqn.invars):
-            reached.update(eqn.outvars)
-    return any(not isinstance(v, Literal) and v in reached for v in jaxpr.outvars)

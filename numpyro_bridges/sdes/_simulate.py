@@ -1,0 +1,41 @@
+"""Paths of the time-discretised model, unconditioned."""
+
+import jax
+import jax.numpy as jnp
+
+from .._checks import floating, require
+from .._linalg import apply, columns, full_precision, varying_like
+from .._types import Noise, State
+from ._base import AbstractSDE, Displaced
+from ._grid import given_grid
+
+
+@full_precision
+def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
+    """A path of the model, unconditioned.
+
+    **Arguments:** `x0` `(n, dim)`; `ts` `(K + 1,)`; `noise` `(K, k, dim)`, standard normal.
+
+    **Returns:** `(K + 1, n, dim)`, the first state being `x0`.
+    """
+    x0, grid = floating(x0, "x0"), given_grid(ts)
+    sde.check_state(x0)
+    times = grid.elapsed.astype(x0.dtype)
+    shape = (times.shape[0] - 1, sde.noise_size(x0), columns(x0))
+    allowed = (shape, shape[:2]) if x0.ndim == 1 else (shape,)
+    require(
+        jnp.shape(noise) in allowed,
+        f"`noise` must have shape {shape}, one row per step; got {jnp.shape(noise)}. Use vmap for a batch.",
+    )
+    noise = jnp.asarray(noise)
+    displaced = Displaced(sde, x0, grid.clock(sde, x0).astype(x0.dtype))
+
+    def step(y, inputs):
+        t0, t1, z = inputs
+        law = displaced.transition(t0, t1, y)
+        y = law.mean + apply(law.factor, z.reshape(z.shape[: y.ndim]))
+        return y, y
+
+    start = varying_like(jnp.zeros_like(x0), displaced, times, noise)
+    _, path = jax.lax.scan(step, start, (times[:-1], times[1:], noise))
+    return jnp.concatenate([x0[None], x0[None] + path])
