@@ -224,16 +224,18 @@ class LinearSDE(AbstractSDE):
         from where it is conditioned to go.
         """
 
-        def noise_free(t):
+        def moved(t):
+            """How far the noise-free path has come."""
             growth, shift, _ = self._flow(t, x0)
-            return x0 + apply(growth, x0) + shift
+            return apply(growth, x0) + shift
 
-        distance = jnp.max(jnp.abs(jax.lax.stop_gradient(end - noise_free(elapsed[-1]))))
-        moves = distance <= jnp.max(jnp.abs(end - x0))  # False of NaN too
+        way = end - x0
+        distance = jnp.max(jnp.abs(jax.lax.stop_gradient(way - moved(elapsed[-1]))))
+        moves = distance <= jnp.max(jnp.abs(way))  # False of NaN too
         times = jnp.where(moves, elapsed, 0.0)
-        gap = end - noise_free(times[-1])
+        gap = way - moved(times[-1])
         drift = jnp.where(moves, apply(self.drift_operator, gap), self.drift(clock, end))
-        origins = jax.vmap(noise_free)(times[:-1]) + gap[None]
+        origins = jax.vmap(moved)(times[:-1]) + (x0 + gap)[None]
         return Frame(self._displaced(drift), jnp.concatenate([origins, end[None]]), -gap)
 
     def linearised_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
