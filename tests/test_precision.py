@@ -171,7 +171,7 @@ def free(ts):
     "build, message",
     [
         (lambda: shifted_bridge(SEASONAL, LATE, LATE + 2.0), "`t0` must leave.*depends on the time.*64.0 apart.*x64"),
-        (lambda: brownian(t1=1.0, num_steps=5000), "`num_steps` must leave steps.*float32 are .*e-08 apart.*x64"),
+        (lambda: brownian(t1=1.0, num_steps=10_000), "`num_steps` must leave steps.*float32 are .*e-07 apart.*x64"),
         (lambda: brownian(ts=[0.0, 1.0, 1.0 + 1e-9]), "`ts` must leave steps that can be told apart.*fewer steps"),
         (lambda: free([0.0, 1.0, 1.0 + 1e-9]), "`ts` must leave"),
         (lambda: free(None), "`ts` must be a number"),
@@ -189,7 +189,7 @@ def test_refused_times(build, message):
 
 
 def test_what_double_precision_represents_is_accepted():
-    assert np.all(np.diff(brownian(t1=1.0, num_steps=5000).ts) > 0)
+    assert np.all(np.diff(brownian(t1=1.0, num_steps=10_000).ts) > 0)
     assert np.all(np.diff(shifted_bridge(SEASONAL, LATE, LATE + 2.0).ts) > 0)
     with jax.enable_x64(False):
         assert np.all(np.diff(brownian(t1=1.0, num_steps=2000).ts) > 0)
@@ -200,25 +200,28 @@ def test_what_double_precision_represents_is_accepted():
 
 
 @pytest.mark.parametrize("kind", ["brownian", "scalar", "dense"])
-@pytest.mark.parametrize("t", [0.0, 0.2, 0.5, 0.9])
-def test_log_h_between_grid_times(kind, t):
-    """The law from x over the time that is left, dense; its derivative by t from central differences of that."""
+def test_log_h_between_grid_times(kind):
+    """The law from x over the time that is left, dense; derivatives by t and x from central differences of that."""
     drift, diffusion, shift, _, make = KINDS[kind]
-    x, v = np.array([0.3, -0.2]), np.array([[0.5], [0.1]])
+    x, v, h = np.array([0.3, -0.2]), np.array([[0.5], [0.1]]), 1e-5
 
-    def truth(t, x=x):
+    def truth(t, x):
         phi, moved, C = exact_affine(drift, np.full((2, 1), shift), as_matrix(diffusion, 2), 1 - t)
         return log_normal(v, phi @ x[:, None] + moved, C + 0.05 * np.eye(2))
 
-    bridge = nb.GuidedBridge(make(1.0), nb.InexactMatch(0.05).at(v[:, 0]), x0=[0.0, 0.0], ts=[0.0, 0.5, 1.0])
-    with jax.disable_jit():
-        np.testing.assert_allclose(bridge.log_h(t, x), truth(t), rtol=1e-10)
-        h = 1e-5
+    @jax.jit
+    @jax.vmap
+    def found(t):
+        condition = nb.InexactMatch(0.05).at(v[:, 0])
+        bridge = nb.GuidedBridge(make(1.0), condition, x0=[0.0, 0.0], ts=[0.0, 0.5, 1.0])
+        return *jax.value_and_grad(bridge.log_h)(t, jnp.asarray(x)), bridge.score(t, jnp.asarray(x))
+
+    times = np.array([0.01, 0.2, 0.5, 0.9])  # one of them is on the grid
+    for t, value, by_time, score in zip(times, *map(np.asarray, found(times)), strict=True):
+        np.testing.assert_allclose(value, truth(t, x), rtol=1e-10)
+        np.testing.assert_allclose(by_time, (truth(t + h, x) - truth(t - h, x)) / (2 * h), rtol=1e-6)
         slopes = [(truth(t, x + h * e) - truth(t, x - h * e)) / (2 * h) for e in np.eye(2)]
-        np.testing.assert_allclose(bridge.score(t, x), slopes, rtol=1e-7)
-    if kind == "scalar" and t > 0:
-        by_time = jax.grad(bridge.log_h)(t, jnp.asarray(x))
-        np.testing.assert_allclose(by_time, (truth(t + h) - truth(t - h)) / (2 * h), rtol=1e-6)
+        np.testing.assert_allclose(score, slopes, rtol=1e-7)
 
 
 @pytest.mark.parametrize("guide", [nb.RecedingGuide(), nb.FrozenGuide(nb.LinearSDE(-0.3, 0.6, 0.1))])
@@ -228,7 +231,7 @@ def test_log_h_is_that_of_the_bridge_from_there(guide):
     condition = nb.InexactMatch(0.05).at([0.5, 0.1])
     whole = nb.GuidedBridge(STILL, condition, x0=[0.0, 0.0], ts=ts, guide=guide)
     with jax.disable_jit():
-        for t in (0.0, 0.3, 0.4, 0.65):
+        for t in (0.3, 0.4):
             rest = nb.GuidedBridge(STILL, condition, x0=x, ts=[t, *ts[ts > t]], guide=guide)
             np.testing.assert_allclose(whole.log_h(t, x), rest.log_h(t, x), rtol=1e-10)
             np.testing.assert_allclose(whole.score(t, x), rest.score(t, x), rtol=1e-10)

@@ -77,7 +77,6 @@ class AbstractCondition(eqx.Module):
     def noise_from_target(self, law_mean: State, law_factor: Structured, seen: State) -> Float[Array, "extra m *dim"]:
         """The extra noise with which `target` chooses `seen`."""
 
-
     def displaced(self, shift: State) -> "AbstractCondition":
         """The condition on what is seen less `shift`; here by adding it again, which costs digits."""
         return _Displaced(self, shift)

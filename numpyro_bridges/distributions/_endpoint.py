@@ -92,7 +92,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
     @property
     def times(self):
         """The times of a path, `(num_steps + 1,)`; with the batch axes in front where data have their own."""
-        ts = self.parts["ts"]
+        ts = self.parts["ts"].ts
         if "ts" not in self._batched:
             return ts
         inner = (1,) * (len(self._full_shape) - len(self._own_shape))

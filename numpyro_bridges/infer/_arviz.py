@@ -134,7 +134,6 @@ def to_arviz(
             "with `keep_noise`, of at most `num_samples`.",
         )
         found = _mapped(lambda draw: bridges(lost(driving) | draw, driven), driving, places)
-        found = {name: (path, np.asarray(grid)) for name, (path, grid) in found.items()}
         leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven}
         datasets["posterior_paths"] = _labelled(found, leading, kept, coords)
     groups = {
