@@ -11,6 +11,7 @@ import pytest
 from jax.example_libraries import stax
 from numpyro.contrib.control_flow import cond, scan
 from numpyro.contrib.module import random_eqx_module
+from numpyro.diagnostics import effective_sample_size
 from numpyro.infer import MCMC, NUTS, Gibbs, init_to_median
 from numpyro.infer.util import potential_energy
 
@@ -27,9 +28,11 @@ from numpyro_bridges.infer import (
 )
 from numpyro_bridges.infer._posterior import is_latent, misfit, sites_of
 from numpyro_bridges.infer._reference import Reference
+from numpyro_bridges.infer._seal import of_arguments, with_key
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
+RNG = np.random.default_rng(0)
 DATA = np.array([[0.4], [0.9]])
 
 
@@ -326,3 +329,106 @@ def test_start_of_one_of_several_chains():
         kernel.init(keys, 0, {"mean": jnp.array([0.0, jnp.inf, jnp.nan])}, (DATA,), {})
     with pytest.raises(ValueError, match=r"shape \(3,\), unconstrained, chains in front; got \(2,\)"):
         kernel.init(keys, 0, {"mean": jnp.zeros(2)}, (DATA,), {})
+
+
+def test_seal():
+    """The same traced or not; another for each change of arguments, of their kind, or of the key."""
+    data, key = RNG.normal(size=(3, 2)), jr.key(0)
+    base = ((data, {"n": 3, "how": "left", "mask": np.array([True, False])}, np.float32(0.5), key), {})
+
+    def of(arguments):
+        return int(with_key(of_arguments(arguments), key))
+
+    def changed(place, value):
+        return (*base[0][:place], value, *base[0][place + 1 :]), {}
+
+    others = [
+        changed(0, -data),
+        changed(0, data[::-1]),
+        changed(0, np.nextafter(data, 9.0)),
+        changed(0, data.reshape(2, 3)),
+        changed(0, data.astype(np.float32)),
+        changed(1, {**base[0][1], "how": "right"}),
+        changed(1, {**base[0][1], "n": 4}),
+        changed(1, {**base[0][1], "mask": np.array([False, True])}),
+        changed(2, np.float32(-0.5)),
+        changed(3, jr.key(1)),
+        (base[0], {"more": None}),
+    ]
+    seals = [of(base), *map(of, others), int(with_key(of_arguments(base), jr.key(2)))]
+    assert len(set(seals)) == len(seals)
+    assert of(((jnp.asarray(data), *base[0][1:]), {})) == seals[0]
+    traced = jax.jit(lambda data, mask, x, key: of_arguments((data, mask, x, key)))
+    parts = data, np.array([True, False]), np.float32(0.5), key
+    np.testing.assert_array_equal(traced(*parts), of_arguments(parts))
+
+
+WARM = {
+    "FunctionSpaceHMC": lambda: FunctionSpaceHMC(model),
+    "PCN": lambda: PCN(fixed(model), num_moves=2, num_blocks=1),
+    "PCNL": lambda: PCNL(fixed(model), num_moves=2),
+    "pseudo-marginal": lambda: CorrelatedPseudoMarginal(model, 3),
+    "MALA": lambda: CorrelatedPseudoMarginalMALA(model, 3),
+}
+
+
+@pytest.mark.parametrize("name", WARM)
+def test_energies_are_those_of_the_data(name):
+    """Also of the first draw on other data, accepted or not; on the same data a chain goes on bit for bit."""
+    kernel, other = WARM[name](), DATA + 4.0
+    start = kernel.init(jr.key(0), 0, None, (DATA,), {})
+
+    @jax.jit
+    def draws(state, data, number):
+        return jax.lax.fori_loop(0, number, lambda _, state: kernel.sample(state, (data,), {}), state)
+
+    def once(state, data):
+        return draws(state, data, 1)
+
+    state = once(once(start, DATA), DATA)
+    for data in (other, DATA, other):
+        new = once(state, data)
+        again = kernel.refresh(new, (data,), {})
+        for field in kernel._energies:
+            found, expected = getattr(new, field), getattr(again, field)
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), found, expected)
+        assert new.seal == again.seal and new.i == state.i + 1
+        state = new
+    whole, parts = draws(start, DATA, 2), once(once(start, DATA), DATA)
+    jax.tree.map(np.testing.assert_array_equal, whole._replace(rng_key=0), parts._replace(rng_key=0))
+
+
+@pytest.mark.parametrize("chains", [1, 2])
+def test_warm_chain_on_new_data(chains):
+    """Passed by name, and under another key; the posterior is the normal one of the new data."""
+    mcmc = MCMC(
+        FunctionSpaceHMC(model),
+        num_warmup=200,
+        num_samples=2000,
+        num_chains=chains,
+        chain_method="vectorized",
+        progress_bar=False,
+        jit_model_args=chains == 1,
+    )
+    mcmc.run(jr.key(0), data=DATA)
+    mcmc.post_warmup_state = mcmc.last_state
+    data = DATA + 2.0
+    mcmc.run(jr.key(1), data=data)
+    slope, variance = 1 - np.exp(-1.0), 0.36 * (1 - np.exp(-2.0)) / 2 + 0.1
+    precision = 1 / 4 + data.size * slope**2 / variance
+    mean, sd = data.sum() * slope / variance / precision, precision**-0.5
+    draws = mcmc.get_samples(group_by_chain=True)["mean"][:, 200:]
+    error = 1 / np.sqrt(effective_sample_size(np.asarray(draws)))
+    assert error < 0.06
+    assert abs(draws.mean() - mean) < 4 * error * sd
+    assert draws.std() == pytest.approx(sd, rel=0.15)
+
+
+def test_warm_gibbs_on_new_data():
+    """`Gibbs` refreshes a block when another has moved; the block that moves first knows by itself."""
+    nuts = NUTS(model, step_size=0.5, adapt_step_size=False)
+    mcmc = MCMC(Gibbs([(PCN(model), noise_sites), (nuts, None)]), num_warmup=5, num_samples=20, progress_bar=False)
+    mcmc.run(jr.key(0), DATA)
+    mcmc.post_warmup_state = mcmc.last_state
+    mcmc.run(jr.key(1), DATA + 4.0)
+    assert np.mean(mcmc.get_samples()["mean"][10:]) > 4.0

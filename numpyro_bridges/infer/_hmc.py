@@ -19,7 +19,7 @@ import jax.random as jr
 from jax import Array
 
 from .._checks import flag, known_number, positive_integer
-from ._kernel import POSITIVE, PROPORTION, PROPORTION_OR_0, AbstractBridgeKernel
+from ._kernel import POSITIVE, PROPORTION, PROPORTION_OR_0, UNSEALED, AbstractBridgeKernel
 from ._posterior import Sites, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
 from ._rotation import choose, half_square, kick, metropolis, normal_like, rotate, total
@@ -42,6 +42,7 @@ class FunctionSpaceHMCState(NamedTuple):
     - `z`: unconstrained values. `misfit`, `gradient`: Φ, minus the log density without the noise's prior.
     - `potential_energy`: minus the log joint density. `energy`: with the kinetic energy of the accepted end.
     - `num_steps`: gradients of this draw. `diverging`: the energy was NaN, or off by more than 1000.
+    - `seal`: by which a chain knows that it starts again, perhaps on other data, and renews its energies.
     """
 
     i: Array
@@ -56,6 +57,7 @@ class FunctionSpaceHMCState(NamedTuple):
     diverging: Array
     adapt_state: AdaptState
     rng_key: Array
+    seal: Array
 
 
 class FunctionSpaceHMC(AbstractBridgeKernel):
@@ -108,18 +110,22 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         adapt = AdaptState(*start_step_size(step), start_windows(reference))
         energy = phi + half_square(self._parts(z)[1])
         i, zero, no = jnp.zeros((), int), jnp.zeros_like(phi), jnp.array(False)
-        return FunctionSpaceHMCState(i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key)
+        return FunctionSpaceHMCState(i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key, UNSEALED)
 
     def _slopes(self, state):
         return state.gradient
 
-    def refresh(self, state, model_args, model_kwargs):
+    @property
+    def _energies(self):
+        return "misfit", "gradient", "potential_energy"
+
+    def _refreshed(self, state, model_args, model_kwargs):
         phi, gradient = jax.value_and_grad(self._misfit)(state.z, model_args, model_kwargs)
         return state._replace(
             misfit=phi, gradient=gradient, potential_energy=phi + half_square(self._parts(state.z)[1])
         )
 
-    def _sample_one(self, state, model_args, model_kwargs):
+    def _sample_one(self, state, still, model_args, model_kwargs):
         key, key_momentum, key_length, key_accept = jr.split(state.rng_key, 4)
         reference = state.adapt_state.windows.reference
         theta, noise, unravel = self._parts(state.z)
@@ -134,9 +140,9 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
 
         # Rounding may lift the quotient above its bound, and the step may come from another kernel.
         steps = jnp.ceil(self._length / state.adapt_state.step_size)
-        steps = jnp.clip(steps, 1, self._max_num_steps).astype(int)
+        steps = jnp.where(still, 1, jnp.clip(steps, 1, self._max_num_steps)).astype(int)
         turn = jr.uniform(key_length, (), y.dtype, 1 - self._jitter, 1 + self._jitter) * self._length
-        half = 0.5 * turn / steps
+        half = jnp.where(still, 0.0, 0.5 * turn / steps)
 
         def leap(_, carry):
             x, p, gradient, _, work = carry
@@ -154,7 +160,7 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         error = new - old + work
         rate, accept = metropolis(key_accept, error)
         moved = to_sites(x), new + half_square(x[0]), unravel(reference.colour_gradient(slope + x[0])) | force
-        z, phi, gradient = choose(accept, moved, (state.z, state.misfit, state.gradient))
+        z, phi, gradient = choose(accept | still, moved, (state.z, state.misfit, state.gradient))
         potential = phi + half_square(self._parts(z)[1])
         return FunctionSpaceHMCState(
             state.i + 1,
@@ -169,6 +175,7 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
             ~(error < _MAX_ENERGY_ERROR),
             self._adapted(state, rate, self._parts(z)[0]),
             key,
+            state.seal,
         )
 
     @property

@@ -5,6 +5,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +34,15 @@ from ._posterior import (
     supports_that_move,
 )
 from ._reference import Reference, laplace
+from ._rotation import choose
+from ._seal import of_arguments, with_key
 
 # Rules of settings, in words and as a test.
 POSITIVE = "positive and finite", lambda x: x > 0
 PROPORTION = "in (0, 1)", lambda x: 0 < x < 1
 PROPORTION_OR_0 = "in [0, 1)", lambda x: 0 <= x < 1
+
+UNSEALED: Any = np.uint32(0)  # of a state that is being made
 
 
 class AbstractBridgeKernel(MCMCKernel):
@@ -60,8 +65,17 @@ class AbstractBridgeKernel(MCMCKernel):
         """The state of one chain that starts at z."""
 
     @abstractmethod
-    def _sample_one(self, state, model_args, model_kwargs):
-        """The next state of one chain."""
+    def _sample_one(self, state, still, model_args, model_kwargs):
+        """The next state of one chain. Where `still`, of a move of no time, which is accepted."""
+
+    @property
+    @abstractmethod
+    def _energies(self) -> tuple[str, ...]:
+        """The fields that depend on the arguments of the model."""
+
+    @abstractmethod
+    def _refreshed(self, state, model_args, model_kwargs):
+        """The state with its energies evaluated again."""
 
     @property
     def model(self):
@@ -89,12 +103,14 @@ class AbstractBridgeKernel(MCMCKernel):
             key, key_start, key_reference = jr.split(key, 3)
             z = self._start(key_start, model_args, model_kwargs) | (init_params or {})
             z, reference = self._near_the_mode(key_reference, z, init_params is not None, model_args, model_kwargs)
-            return self._init_one(key, z, reference, model_args, model_kwargs)
+            state = self._init_one(key, z, reference, model_args, model_kwargs)
+            return _sealed(state, _seal_of(model_args, model_kwargs))
 
         over_chains = (lambda fn: fn) if num_chains is None else partial(_over_chains, num_chains=num_chains)
 
         def sample(state, model_args, model_kwargs):
-            return over_chains(lambda state: self._sample_one(state, model_args, model_kwargs))(state)
+            seal = _seal_of(model_args, model_kwargs)
+            return over_chains(lambda state: self._next(state, seal, model_args, model_kwargs))(state)
 
         self._sample_fn = sample
         state = jax.jit(over_chains(one))(rng_key, init_params)
@@ -106,6 +122,25 @@ class AbstractBridgeKernel(MCMCKernel):
         if step is None:
             raise ValueError("`init` must be called before `sample`.")
         return step(state, model_args, dict(model_kwargs or {}))
+
+    def refresh(self, state, model_args, model_kwargs):
+        state = self._refreshed(state, model_args, model_kwargs)
+        return _sealed(state, _seal_of(model_args, model_kwargs))
+
+    def _next(self, state, seal, model_args, model_kwargs):
+        """The next state of one chain. Where the energies are stale, a move of no time renews them first.
+
+        It is the program of the draw itself: another would have to be compiled, and a branch would
+        be taken in every draw of chains under `jax.vmap`.
+        """
+
+        def draw(j, state):
+            new = self._sample_one(state, j < 0, model_args, model_kwargs)
+            renewed = state._replace(**{name: getattr(new, name) for name in self._energies})
+            return choose(j < 0, renewed, new)
+
+        stale = state.seal != with_key(seal, state.rng_key)
+        return _sealed(jax.lax.fori_loop(jnp.where(stale, -1, 0), 1, draw, state), seal)
 
     def postprocess_fn(self, model_args, model_kwargs):
         """Constrained values, and those of deterministic sites."""
@@ -212,6 +247,16 @@ class AbstractBridgeKernel(MCMCKernel):
         n = jnp.where(self._warming(state), state.i, state.i - self._num_warmup) + 1
         mean = jnp.where(n == 1, 0.0, state.mean_accept_prob)
         return mean + (rate - mean) / n
+
+
+def _seal_of(model_args, model_kwargs):
+    """Of what the model is given, but for the values of other blocks of `Gibbs`, which tells when they change."""
+    kwargs = {name: x for name, x in (model_kwargs or {}).items() if name != GIBBS_SITES_KWARG}
+    return of_arguments((tuple(model_args), kwargs))
+
+
+def _sealed(state, seal):
+    return state._replace(seal=with_key(seal, state.rng_key))
 
 
 def _starts(values, sites, constrained: bool, num_chains: int | None) -> Sites:

@@ -23,7 +23,7 @@ import jax.random as jr
 from jax import Array
 
 from .._checks import flag, known_number, positive_integer, require
-from ._kernel import PROPORTION, AbstractBridgeKernel
+from ._kernel import PROPORTION, UNSEALED, AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
 
@@ -35,7 +35,7 @@ class PCNState(NamedTuple):
     - `energies`: -log p(v_s | θ, z_s), an array for each noise site; one number where data share noise, or where it has
       other uses. `force`: minus their gradient, in `PCNL`.
     - `angles`: φ, shaped as `energies`, adapted in the warm-up. `accept_prob`: the mean over data and moves.
-    - `diverging`: an energy was NaN.
+    - `diverging`: an energy was NaN. `seal`: by which a chain knows that it starts again, perhaps on other data.
     """
 
     i: Array
@@ -48,6 +48,7 @@ class PCNState(NamedTuple):
     mean_accept_prob: Array
     diverging: Array
     rng_key: Array
+    seal: Array
 
 
 class AbstractPCN(AbstractBridgeKernel):
@@ -91,22 +92,26 @@ class AbstractPCN(AbstractBridgeKernel):
         energies, force = self._evaluate(z, model_args, model_kwargs)
         angles = tuple(jnp.full_like(energy, self._angle) for energy in energies)
         i, zero, no = jnp.array(0), jnp.zeros_like(total(energies)), jnp.array(False)
-        return PCNState(i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key)
+        return PCNState(i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key, UNSEALED)
 
-    def refresh(self, state, model_args, model_kwargs):
+    @property
+    def _energies(self):
+        return "potential_energy", "energies", "force"
+
+    def _refreshed(self, state, model_args, model_kwargs):
         energies, force = self._evaluate(state.z, model_args, model_kwargs)
         return state._replace(potential_energy=_potential(state.z, energies), energies=energies, force=force)
 
-    def _sample_one(self, state, model_args, model_kwargs):
+    def _sample_one(self, state, still, model_args, model_kwargs):
         key, key_moves = jr.split(state.rng_key)
 
         def move(m, carry):
             state, rates = carry
-            state, rate = self._move(jr.fold_in(key_moves, m), m, state, model_args, model_kwargs)
+            state, rate = self._move(jr.fold_in(key_moves, m), m, state, still, model_args, model_kwargs)
             return state, rates + rate / self._num_moves
 
         start = (state._replace(diverging=jnp.array(False)), jnp.zeros_like(state.accept_prob))
-        new, rate = jax.lax.fori_loop(0, self._num_moves, move, start)
+        new, rate = jax.lax.fori_loop(0, jnp.where(still, 1, self._num_moves), move, start)
         return new._replace(
             i=state.i + 1,
             potential_energy=_potential(new.z, new.energies),
@@ -115,13 +120,13 @@ class AbstractPCN(AbstractBridgeKernel):
             rng_key=key,
         )
 
-    def _move(self, key, m, state, model_args, model_kwargs):
+    def _move(self, key, m, state, still, model_args, model_kwargs):
         """Turns the noise of one block of time steps, and decides for each datum."""
         key_p, key_accept = jr.split(key)
         old, groups = state.z, groups_of(state.z, self._owners)
         block = (state.i * self._num_moves + m) % self._num_blocks
         turns = {
-            name: _widened(angle, old[name]) * _inside(block, self._num_blocks, old[name])
+            name: _widened(jnp.where(still, 0.0, angle), old[name]) * _inside(block, self._num_blocks, old[name])
             for group, angle in zip(groups, state.angles, strict=True)
             for name in group
         }
@@ -136,7 +141,7 @@ class AbstractPCN(AbstractBridgeKernel):
         ):
             work = sum(_sum_to(before[name] + after[name], e_new) for name in group if name in force)
             rate, decisions = metropolis(key, e_new - e_old + work)
-            accept |= {name: decisions for name in group}
+            accept |= {name: decisions | still for name in group}
             rates.append(rate)
 
         def chosen(new, old):

@@ -24,7 +24,7 @@ from jax import Array
 from jax.scipy.special import logsumexp
 
 from .._checks import concrete, known_number, positive_integer, require
-from ._kernel import POSITIVE, PROPORTION_OR_0, AbstractBridgeKernel
+from ._kernel import POSITIVE, PROPORTION_OR_0, UNSEALED, AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
 from ._rotation import choose, kick, metropolis, normal_like, rotate, total
@@ -39,7 +39,7 @@ class PseudoMarginalState(NamedTuple):
     - `z`: unconstrained parameters, and for each datum the noise of one bridge, drawn with the weights.
     - `particles`: u, noise with an axis of N in front. `potential_energy`: minus log prior and log estimate.
     - `force`: minus its gradient in the parameters, for MALA. `step_size`: in whitened parameters.
-    - `diverging`: the estimate of the proposal was NaN.
+    - `diverging`: the estimate of the proposal was NaN. `seal`: by which a chain knows that it starts again.
     """
 
     i: Array
@@ -53,6 +53,7 @@ class PseudoMarginalState(NamedTuple):
     mean_accept_prob: Array
     diverging: Array
     rng_key: Array
+    seal: Array
 
 
 class AbstractPseudoMarginal(AbstractBridgeKernel):
@@ -137,9 +138,13 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         zero, no = jnp.zeros_like(value), jnp.array(False)
         windows, i = start_windows(reference), jnp.array(0)
         step = jnp.asarray(step, value.dtype)
-        return PseudoMarginalState(i, z, particles, value, force, step, windows, zero, zero, no, key)
+        return PseudoMarginalState(i, z, particles, value, force, step, windows, zero, zero, no, key, UNSEALED)
 
-    def refresh(self, state, model_args, model_kwargs):
+    @property
+    def _energies(self):
+        return "z", "potential_energy", "force"
+
+    def _refreshed(self, state, model_args, model_kwargs):
         theta, _, unravel = self._parts(state.z)
         potential = self._potential(state.particles, unravel, model_args, model_kwargs)
         (value, _), force = self._evaluate(potential, theta)
@@ -173,14 +178,15 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
                 picked[name] = jnp.take_along_axis(u, at, axis=0)[0]
         return picked
 
-    def _sample_one(self, state, model_args, model_kwargs):
+    def _sample_one(self, state, still, model_args, model_kwargs):
         key, key_p, key_u, key_accept, key_pick = jr.split(state.rng_key, 5)
         theta, _, unravel = self._parts(state.z)
-        reference, step_size = state.windows.reference, state.step_size
+        reference = state.windows.reference
+        step_size = state.step_size * ~still
         half = 0.5 * step_size
         p, before = kick(jr.normal(key_p, theta.shape, theta.dtype), reference.whiten_gradient(state.force), half)
         theta_new = theta + step_size * reference.scale @ p
-        particles, _ = rotate(state.particles, normal_like(key_u, state.particles), self._turn)
+        particles, _ = rotate(state.particles, normal_like(key_u, state.particles), self._turn * ~still)
         potential = self._potential(particles, unravel, model_args, model_kwargs)
         (value, energies), force = self._evaluate(potential, theta_new)
         _, after = kick(p, reference.whiten_gradient(force), half)
@@ -188,12 +194,20 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         rate, accept = metropolis(key_accept, error)
         moved = unravel(theta_new) | self._pick(key_pick, particles, energies), particles, value, force
         kept = state.z, state.particles, state.potential_energy, state.force
-        z, particles, value, force = choose(accept, moved, kept)
+        z, particles, value, force = choose(accept | still, moved, kept)
         windows, _ = update_windows(state.windows, state.i, self._num_warmup, self._parts(z)[0])
         windows = choose(self._warming(state), windows, state.windows)
-        mean = self._running_mean(state, rate)
-        return PseudoMarginalState(
-            state.i + 1, z, particles, value, force, step_size, windows, rate, mean, jnp.isnan(error), key
+        return state._replace(
+            i=state.i + 1,
+            z=z,
+            particles=particles,
+            potential_energy=value,
+            force=force,
+            windows=windows,
+            accept_prob=rate,
+            mean_accept_prob=self._running_mean(state, rate),
+            diverging=jnp.isnan(error),
+            rng_key=key,
         )
 
 
