@@ -8,6 +8,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._checks import as_float, concrete, require, require_finite, require_instance
@@ -177,7 +178,7 @@ class GuidedBridge(eqx.Module):
         return isinstance(self.solver, GuidedStep)
 
     @property
-    def ts(self) -> Array:
+    def ts(self) -> Array | np.ndarray:
         """The grid `(K + 1,)`, from t0 to t1."""
         return self.grid.ts
 

@@ -86,6 +86,9 @@ class _Displaced(AbstractCondition):
     condition: AbstractCondition
     shift: State
 
+    def __init__(self, condition: AbstractCondition, shift: State):
+        self.condition, self.shift = condition, shift
+
     @property
     def num_extra_noises(self):
         return self.condition.num_extra_noises

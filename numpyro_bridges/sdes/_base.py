@@ -6,7 +6,7 @@ States are `(n, dim)` or `(n,)`; σ acts on the first axis, so a = σσᵀ is n 
 import abc
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -183,8 +183,8 @@ class AbstractSDE(eqx.Module):
 class Frame(NamedTuple):
     """Displacements y = x − o(t) from a path o that ends where the end state is to be."""
 
-    sde: AbstractSDE
-    """Of y, in the time that has elapsed."""
+    sde: Any
+    """The SDE of y, in the time that has elapsed: a `Displaced` where the origin does not move."""
     origins: Float[Array, "K+1 n *dim"]
     """o at the grid times, the last being the state that meets the condition."""
     start: State
@@ -200,6 +200,9 @@ class Displaced(AbstractSDE):
     sde: AbstractSDE
     origin: State
     clock: Float[Array, ""]
+
+    def __init__(self, sde: AbstractSDE, origin: State, clock: RealScalar):
+        self.sde, self.origin, self.clock = sde, origin, jnp.asarray(clock)
 
     @property
     def space(self) -> AbstractSpace | None:
@@ -254,7 +257,7 @@ def still_frame(
 ) -> Frame:
     """Displacements from `end`, at all times."""
     origins = jnp.broadcast_to(end, (elapsed.shape[0], *end.shape))
-    return Frame(Displaced(sde, end, jnp.asarray(clock)), origins, x0 - end)
+    return Frame(Displaced(sde, end, clock), origins, x0 - end)
 
 
 def depends_on(f: Callable, x: Array) -> bool:

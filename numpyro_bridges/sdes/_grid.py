@@ -4,6 +4,8 @@ A grid holds its start t0 and the times that have *elapsed* since: at a large t0
 precision has no digits left for the steps. What is known is prepared in double precision, whatever the default.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +21,8 @@ _PRECISION = 'or use double precision: `jax.config.update("jax_enable_x64", True
 class TimeGrid(eqx.Module):
     """The times t0 + `elapsed` `(K + 1,)`, the first elapsed time being 0. As an array it is its times."""
 
-    t0: Float[Array, ""]
+    t0: Any
+    """A NumPy number of double precision where it is known."""
     elapsed: Float[Array, " K+1"]
 
     @property
@@ -28,7 +31,7 @@ class TimeGrid(eqx.Module):
         return self.elapsed.shape[-1] - 1
 
     @property
-    def ts(self) -> Array:
+    def ts(self) -> Array | np.ndarray:
         """The times; a NumPy array of double precision where the default would lose their digits."""
         begin, elapsed = concrete(self.t0), concrete(self.elapsed)
         if begin is None or elapsed is None:
@@ -40,9 +43,10 @@ class TimeGrid(eqx.Module):
 
     def since(self, t: RealScalar) -> Float[Array, ""]:
         """The time elapsed at t, without losing digits where both are known."""
-        dtype, begin, t = self.elapsed.dtype, concrete(self.t0), exact_float(t, "t")
-        known = begin is not None and isinstance(t, np.ndarray)
-        return jnp.asarray(t - begin if known else t - jnp.asarray(self.t0, dtype), dtype)
+        dtype, begin, time = self.elapsed.dtype, concrete(self.t0), exact_float(t, "t")
+        if begin is not None and isinstance(time, np.ndarray):
+            return jnp.asarray(time - begin, dtype)
+        return jnp.asarray(time, dtype) - jnp.asarray(self.t0, dtype)
 
     def clock(self, sde: AbstractSDE, x: State) -> Float[Array, ""]:
         """What is added to the elapsed time that an SDE is shown: t0, or 0 where the time makes no difference to it.
