@@ -274,7 +274,8 @@ def require_mapping(value: Any, name: str) -> None:
 
 def require_instance(value: Any, kind: type | tuple[type, ...], name: str, cure: str) -> None:
     """The value is of a class, whose name says what is meant."""
-    require(isinstance(value, kind), f"`{name}` must be {cure}; got {words(value)}.")
+    if not isinstance(value, kind):  # words of a large object take longer than the check
+        raise ValueError(f"`{name}` must be {cure}; got {words(value)}.")
 
 
 def require_finite(x: jax.Array | np.ndarray, name: str, cure: str = "") -> None:

@@ -16,6 +16,7 @@ from jaxtyping import PRNGKeyArray
 
 from . import weights
 from ._checks import positive_integer, require, require_instance
+from ._closed import close
 from ._linalg import apply, full_precision
 from ._types import RealScalar, State
 from .bridges import GuidedBridge
@@ -253,8 +254,11 @@ def _threshold(num_particles: int) -> float:
 
 def _checked_score_error(bridge: GuidedBridge, score, keys) -> float:
     require(callable(score), f"`score` must be a function (t, x) of a time and a state; got {score!r}.")
-    shape = jax.eval_shape(score, bridge.ts[0], bridge.x0).shape
-    require(shape == bridge.x0.shape, f"`score` must return a vector like the state, {bridge.x0.shape}; got {shape}.")
+    score = close(score, bridge.ts[0], bridge.x0)
+    require(
+        score.shape == bridge.x0.shape,
+        f"`score` must return a vector like the state, {bridge.x0.shape}; got {score.shape}.",
+    )
     return float(_score_error(bridge, score, keys))
 
 

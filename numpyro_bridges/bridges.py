@@ -117,19 +117,23 @@ class GuidedBridge(eqx.Module):
             f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Use vmap for a batch.",
         )
         require_finite(x0, "x0")
+        grid = time_grid(t0, t1, num_steps, ts, graded=condition.exact)
+        sde = sde.closed(grid.elapsed[0], x0)
         sde.check_state(x0)
+        x0 = sde.start(x0)
         condition.check(sde, x0)
         if guide is None:
             guide = default_guide(sde, x0)
         require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         guide.check(sde, x0)
-        self.sde, self.condition, self.x0, self.guide = sde, condition, x0, guide
-        self.grid = time_grid(t0, t1, num_steps, ts, graded=condition.exact)
-        self.clock = self.grid.clock(sde, x0)
+        self.sde, self.condition, self.x0 = sde, condition, x0
+        self.guide = guide.closed(sde, x0, grid.elapsed)
+        self.grid, self.clock = grid, grid.clock(sde, x0)
         self.solver = GuidedStep() if solver is None else solver
         self._check_solver()
         if condition.exact:
             self._check_exact()
+        sde.check_end(lambda: self.end()[1])
 
     def _check_solver(self):
         name = type(self.solver).__name__

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 LAYERS = [
     {"_types", "_checks", "_files"},
     {"_linalg", "weights"},
-    {"spaces", "kernels", "shapes"},
+    {"_closed", "spaces", "kernels", "shapes"},
     {"sdes"},
     {"conditioning"},
     {"guiding"},

@@ -10,6 +10,7 @@ p being the density that `sample` draws from: N(z; 0, I) exp(log_prob(v | z)) is
 
 from collections.abc import Iterable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -84,6 +85,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         parts["ts"], own = _grids(times, batch_shape, num_steps=num_steps, graded=exact)
         names += ("ts",) if own else ()
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
+        _close(parts, one, names, len(batch_shape))
         noise_shape = _bridge(one, datum).noise_shape
         declared = batched is not None
         plain = ("ts",) if ts is None else ()
@@ -189,6 +191,21 @@ def _bridge(parts, value) -> GuidedBridge:
     return GuidedBridge(parts["sde"], condition, x0=parts["x0"], ts=parts["ts"], guide=parts["guide"])
 
 
+def _close(parts, one, names, num_axes) -> None:
+    """Freezes what users' functions read, for one law and for the batch."""
+
+    def set_closed(name, close):
+        one[name] = close(one[name])
+        for _ in range(num_axes if name in names else 0):
+            close = eqx.filter_vmap(close)
+        parts[name] = close(parts[name])
+
+    x0, ts = one["x0"], one["ts"].elapsed
+    set_closed("sde", lambda sde: sde.closed(ts[0], x0))
+    if parts["guide"] is not None:
+        set_closed("guide", lambda guide: guide.closed(one["sde"], x0, ts))
+
+
 def _path(parts, value, noise):
     return _bridge(parts, value).path(noise)
 
@@ -202,11 +219,12 @@ def _free_path(parts, key):
 def _seen(parts):
     """Shape of what is seen, by tracing one step and its observation."""
 
-    def seen(key):
-        sde, x0 = parts["sde"], parts["x0"]
-        return parts["match"].sample(key, sde, sde.transition(jnp.zeros(()), jnp.ones(()), x0).mean)
+    def seen(t0, t1, x0, key):
+        sde = parts["sde"]
+        return parts["match"].sample(key, sde, sde.transition(t0, t1, x0).mean)
 
-    return jax.eval_shape(seen, jr.key(0))
+    time = jax.ShapeDtypeStruct((), parts["x0"].dtype)  # no number: a coefficient may be defined on [t0, t1] only
+    return jax.eval_shape(seen, time, time, parts["x0"], jr.key(0))
 
 
 def _check(parts):

@@ -72,6 +72,10 @@ class AbstractGuide(eqx.Module):
         """`ValueError` where the guide does not fit states shaped like x."""
         return None
 
+    def closed(self, sde: AbstractSDE, x: State, ts) -> "AbstractGuide":
+        """The same guide for one bridge, with what a user's functions read frozen as it is now."""
+        return self
+
     def auxiliary_process(self, sde: Displaced, reference: State, t1: RealScalar) -> LinearSDE:
         """The linear process whose h̃ is an exact h-transform, for the continuous-time weight."""
         raise ValueError(
@@ -227,6 +231,9 @@ class DriftGuide(AbstractGuide):
     @property
     def moves(self):
         return self.guide.moves
+
+    def closed(self, sde, x, ts):
+        return DriftGuide(self.guide.closed(sde, x, ts))
 
     def plan(self, sde, seen, reference, ts):
         plan = self.guide.plan(sde, seen, reference, ts)

@@ -10,13 +10,16 @@ the network says (Yang, van der Meulen and Sommer 2025).
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._checks import require, require_instance, words
+from .._closed import Closed, close
 from .._linalg import apply, diagonal, transpose
 from .._types import Noise, State, Structured
 from ..conditioning import GaussianMessage
@@ -95,6 +98,8 @@ class ScoreGuide(AbstractGuide):
     context: Context | None = eqx.field(static=True, default=None, converter=_context)
     history: dict[str, Array] = eqx.field(default_factory=dict)
     held: Callable | None = None
+    programs: tuple[Closed | None, Closed | None] = (None, None)
+    """Network and context as one bridge holds them, where they are functions that may read more than their leaves."""
 
     def __check_init__(self):
         require_instance(self.guide, AbstractGuide, "guide", "a guide, such as `RecedingGuide()`")
@@ -112,7 +117,17 @@ class ScoreGuide(AbstractGuide):
             f"`guide` was trained for states {scale}; got a state {x.shape}. Only landmarks may change their number.",
         )
 
+    def closed(self, sde, x, ts):
+        context = None if self.context is None else close(self.context, sde)
+        network = None
+        if jax.tree_util.all_leaves((self.network,)):  # a plain function
+            v = x.reshape(x.shape[0], -1)
+            theta = jnp.zeros(0 if context is None else context.shape, x.dtype)
+            network = close(self.network, ts[0], v, v, theta)
+        return replace(self, guide=self.guide.closed(sde, x, ts), programs=(network, context))
+
     def plan(self, sde, seen, reference, ts):
+        network, context = self.programs
         base = self.guide.plan(sde, seen, reference, ts)
         n, dtype = reference.shape[0], reference.dtype
         weights = jnp.ones(n, dtype) if sde.space is None else sde.space.weights.astype(dtype)
@@ -120,12 +135,14 @@ class ScoreGuide(AbstractGuide):
         unit = weights * jnp.sqrt(jnp.sum(weights) / jnp.sum(weights * a) / self.standard.duration)
         pooled = isinstance(sde.space, Landmarks)
         theta = jnp.zeros(0, dtype)
-        if self.context is not None:
-            theta = (self.context(sde.sde) - self.standard.context_mean) / self.standard.context_scale
+        context = self.context if context is None else context
+        if context is not None:
+            theta = (context(sde.sde) - self.standard.context_mean) / self.standard.context_scale
         v = reference.reshape(n, -1)
         target = self.standard.target(v + sde.origin.reshape(v.shape), pooled)
         inputs = v, target, theta
-        return ScorePlan((base.steps, ts[-1] - ts[:-1]), base, self.network, self.held, self.standard, unit, inputs)
+        network = self.network if network is None else network
+        return ScorePlan((base.steps, ts[-1] - ts[:-1]), base, network, self.held, self.standard, unit, inputs)
 
 
 class ScorePlan(AbstractPlan):

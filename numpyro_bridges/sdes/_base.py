@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.extend.core import Literal
 from jaxtyping import Array, Float
 
+from .._checks import require, require_instance
 from .._linalg import add, apply, promote
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
@@ -85,7 +86,7 @@ class AbstractSDE(eqx.Module):
 
     def is_autonomous(self, x: State) -> bool:
         """Whether b and σ are known not to depend on t; such an SDE is shown the time that has elapsed since t0."""
-        return not depends_on(lambda t: (self.drift(t, x), self.noise(t, x)), jnp.zeros(()))
+        return not depends_on(lambda t, y: (self.drift(t, y), self.noise(t, y)), x, 0)
 
     def frame(self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar) -> "Frame":
         """Displacements from `end`. An SDE whose noise-free path is known may let the origin move along it."""
@@ -112,9 +113,16 @@ class AbstractSDE(eqx.Module):
             return jnp.zeros((), x.dtype)
         return divergence(lambda y: self.covariance_divergence(t, y), x)
 
+    def closed(self, t: RealScalar, x: State) -> "AbstractSDE":
+        """The same SDE for states shaped like x, with what a user's functions read frozen as it is now.
+
+        An SDE whose coefficients are computed from its own leaves is that already.
+        """
+        return self
+
     def noise_size(self, x: State) -> int:
         """Number k of driving noises per column."""
-        factor = jax.eval_shape(self.diffusion, 0.0, x)
+        factor = at_any_time(self.diffusion, x)
         return factor.shape[1] if len(factor.shape) == 2 else x.shape[0]
 
     def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
@@ -164,16 +172,24 @@ class AbstractSDE(eqx.Module):
             diffrax.ODETerm(lambda t, y, args: self.drift(jnp.asarray(t), y)), DiffusionTerm(self.diffusion, control)
         )
 
+    def start(self, x: State) -> State:
+        """x, a start; NaN, which is seen in every weight, where `check_state` would refuse it but x is traced."""
+        return x
+
+    def check_end(self, find: Callable[[], State]) -> None:
+        """Warns where the state that `find()` returns, to which paths are led, is beyond what the SDE can represent."""
+        return None
+
     def check_state(self, x: State) -> None:
-        """`ValueError` where x cannot be a state of this SDE."""
-        factor, _ = jax.eval_shape(self.noise, 0.0, x)
-        drift = jax.eval_shape(self.drift, 0.0, x)
+        """`ValueError` where x cannot be a state of this SDE. Coefficients are traced, at no time in particular."""
+        require_space(self.space, x)
+        factor, drift = at_any_time(lambda t, y: (self.diffusion(t, y), self.drift(t, y)), x)
         if drift.shape != x.shape:
             raise ValueError(
                 f"`drift` must return an array shaped like the state, {x.shape}; got {drift.shape}. "
                 "A parameter with a batch axis does this too: vmap over it."
             )
-        if factor.shape and factor.shape[0] != x.shape[0]:
+        if factor.shape and (factor.shape[0] != x.shape[0] or 0 in factor.shape):
             raise ValueError(
                 f"`diffusion` must be a scalar, a diagonal ({x.shape[0]},) or a matrix ({x.shape[0]}, k); "
                 f"got {factor.shape} for a state {x.shape}."
@@ -260,14 +276,39 @@ def still_frame(
     return Frame(Displaced(sde, end, clock), origins, x0 - end)
 
 
-def depends_on(f: Callable, x: Array) -> bool:
-    """Whether f(x) is computed from x, by following x through the traced program (a `True` may be over-cautious)."""
-    jaxpr = jax.make_jaxpr(f)(x).jaxpr
-    reached = set(jaxpr.invars)
+def depends_on(f: Callable, x: State, argument: int) -> bool:
+    """Whether f(t, x) is computed from t, argument 0, or from x, argument 1, by the traced program.
+
+    The argument is followed from equation to equation: a `True` may be over-cautious.
+    """
+    time = jax.ShapeDtypeStruct((), x.dtype)
+    jaxpr = jax.make_jaxpr(lambda t, y: f(t, y))(time, x).jaxpr
+    reached = {jaxpr.invars[argument]}
     for eqn in jaxpr.eqns:
         if any(not isinstance(v, Literal) and v in reached for v in eqn.invars):
             reached.update(eqn.outvars)
     return any(not isinstance(v, Literal) and v in reached for v in jaxpr.outvars)
+
+
+def at_any_time(coefficient: Callable, x: State):
+    """Shapes of a coefficient (t, x), which may be defined on [t0, t1] only: the time is traced, and no number."""
+    time = jax.ShapeDtypeStruct((), x.dtype)
+    # a new function at each call: JAX keeps shapes by the function
+    return jax.eval_shape(lambda t, y: coefficient(t, y), time, x)
+
+
+def require_space(space: AbstractSpace | None, x: State | None = None) -> None:
+    """`space` is a space or `None`, and x is one of its states."""
+    if space is None:
+        return
+    require_instance(space, AbstractSpace, "space", "a space, such as `Landmarks(num_points, dim)`, or `None`")
+    if x is not None:
+        shape = (space.size, space.dim)
+        require(
+            x.shape == shape or (x.shape == shape[:1] and space.dim == 1),
+            f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}. Give the space of these states, "
+            "or none.",
+        )
 
 
 def divergence(field: Callable, x: State) -> Float[Array, ""]:

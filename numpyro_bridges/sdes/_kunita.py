@@ -5,17 +5,27 @@ The covariance of two points is a(x, x') = ∫ k(x, y) k(x', y) dy, for the Gaus
 Sommer, Schauer, van der Meulen (2021), and Baker et al. (2024), section 2.
 """
 
+import warnings
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from .._checks import concrete, require, require_instance
 from .._types import RealScalar, State, Structured
 from ..kernels import AbstractKernel
 from ..spaces import AbstractSpace, Landmarks
-from ._base import AbstractSDE
+from ._base import AbstractSDE, at_any_time
 from ._noise import NOISES, AbstractNoise, LandmarkNoise
+
+_COINCIDE = 1e-6
+"""Distance of two landmarks, relative to the size of the shape, at which they are one."""
+
+_SEEN, _REFUSED = 0.01, 0.1
+"""Wrong parts of a(x, x) from which on there is a warning, and an error."""
 
 
 class KunitaFlow(AbstractSDE):
@@ -111,22 +121,80 @@ class KunitaFlow(AbstractSDE):
     def ito_is_stratonovich(self, x: State) -> bool:
         return self.noise_field.fixed_in_space
 
-    def noise_error(self) -> dict:
-        """What a spectral representation leaves out, relative to a(x, x); empty for the others."""
-        error = getattr(self.noise_field, "error", None)
-        return {} if error is None else error(self.kernel, self.covariance_kernel, self.space.dim)
+    def noise_error(self, x: Float[Array, "... n dim"] | None = None) -> dict:
+        """What spectral or grid noise gets wrong, relative to a(x, x); empty for landmark noise.
+
+        **Arguments:** `x`: a state, or a path `(K + 1, n, dim)`, of which the worst state counts. Without it spectral
+        noise answers for shapes of its `diameter`.
+
+        **Returns:** a dictionary. Of spectral noise, `tail`, the variance that is missing at each point for want of
+        modes, and `wrap_around`, the covariance of the ends of the shape through the periodic image. Of grid noise at
+        x, `edge`, the variance that is lost where points are too near the edge of the box, and `quadrature`, the whole
+        error of a(x, x). A `UserWarning` says which of them are above 1 %.
+
+        A start with 10 % or more of `wrap_around` or `edge` is refused. A path that comes to half of a(x, x), at the
+        edge of the box, is NaN from there on, and so is its weight; what lies between is seen here only.
+        """
+        points = None
+        if x is not None:
+            x = jnp.asarray(x)
+            shape = (self.space.size, self.space.dim)
+            require(
+                x.ndim in (2, 3) and x.shape[-2:] == shape,
+                f"`x` must be a state {shape} or a path of them; got {x.shape}. Use vmap for a batch.",
+            )
+            points = jax.vmap(self.space.to_points)(x.reshape(-1, *shape))
+        error = self.noise_field.error(self.kernel, self.covariance_kernel, self.space.dim, points)
+        large = [f"{name} {float(e):.2g}" for name, e in error.items() if concrete(e) is not None and e > _SEEN]
+        if large:
+            warnings.warn(f"the noise is wrong by more than 1 % of a(x, x): {', '.join(large)}.", stacklevel=2)
+        return error
+
+    def start(self, x: State) -> State:
+        if concrete(x) is not None or not isinstance(self.noise_field, LandmarkNoise) or len(x) == 1:
+            return x
+        y = lax.stop_gradient(x)
+        apart = jnp.min(_distances(jnp, y)) > _COINCIDE * (jnp.max(y) - jnp.min(y))
+        return jnp.where(apart, x, jnp.nan)
 
     def check_state(self, x: State) -> None:
         shape = (self.space.size, self.space.dim)
         require(x.shape == shape, f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}.")
-        jax.eval_shape(self.noise, 0.0, x)
+        at_any_time(self.noise, x)
         value = concrete(x)
         if value is not None and isinstance(self.noise_field, LandmarkNoise) and len(value) > 1:
-            gap = np.linalg.norm(value[:, None] - value[None], axis=-1) + np.where(np.eye(len(value)), np.inf, 0)
+            gap = _distances(np, value)
             i, j = np.unravel_index(np.argmin(gap), gap.shape)
             require(
-                gap[i, j] > 1e-6 * np.ptp(value),
+                gap[i, j] > _COINCIDE * np.ptp(value),
                 f"`x0` must have distinct landmarks; {min(i, j)} and {max(i, j)} coincide (distance {gap[i, j]:.1e}): "
                 "they move as one point and their covariance is singular. Remove one of them, or use "
                 '`noise="spectral"`.',
             )
+        self._check_room("x0", x, refuse=True)
+
+    def check_end(self, find: Callable[[], State]) -> None:
+        if self.noise_field.fixed_in_space:
+            self._check_room("condition", find(), refuse=False)
+
+    def _check_room(self, name: str, x: State, refuse: bool) -> None:
+        """Where it can be known, says whether the noise has room for a state."""
+        field = (self.kernel, self.covariance_kernel)
+        if concrete(x) is None or not self.noise_field.fixed_in_space:
+            return
+        points = self.space.to_points(x)
+        lost = concrete(self.noise_field.misfit(*field, points))
+        if lost is None or lost <= _SEEN:
+            return
+        message = (
+            f"`{name}` does not fit the noise, which is wrong there by {100 * lost:.0f} % of a(x, x): "
+            f"{self.noise_field.room(*field, np.asarray(points))}."
+        )
+        require(not refuse or lost < _REFUSED, message)
+        warnings.warn(message, stacklevel=3)
+
+
+def _distances(xp, x):
+    """|x_i − x_j|, infinite for i = j."""
+    square = xp.sum((x[:, None] - x[None]) ** 2, axis=-1)
+    return xp.where(xp.eye(len(x), dtype=bool), xp.inf, xp.sqrt(square))

@@ -16,7 +16,7 @@ from .._checks import as_float, concrete, require, require_finite
 from .._linalg import add, apply, cholesky, compose, congruence, promote, symmetric, transpose, varying_like
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
-from ._base import AbstractSDE, AffineStep, Frame, Transition, as_state_shift
+from ._base import AbstractSDE, AffineStep, Frame, Transition, as_state_shift, require_space
 
 _TERMS, _DOUBLINGS = 22, 20
 """Of the series, at a norm of at most 1, and of the step: B dt up to 2^20."""
@@ -92,6 +92,7 @@ class BrownianMotion(AbstractSDE):
 
     def __init__(self, covariance: ArrayLike, *, space: AbstractSpace | None = None):
         self.covariance_operator = _covariance(covariance, "covariance")
+        require_space(space)
         self.space = space
 
     def drift(self, t: RealScalar, x: State) -> State:
@@ -136,6 +137,7 @@ class LinearSDE(AbstractSDE):
         self.drift_operator = as_float(drift, "drift")
         self.diffusion_operator = as_float(diffusion, "diffusion")
         self.shift = as_float(shift, "shift")
+        require_space(space)
         self.space = space
         for name, value in (
             ("drift", self.drift_operator),
@@ -148,6 +150,7 @@ class LinearSDE(AbstractSDE):
         require(B.ndim < 2 or B.shape[0] == B.shape[1], f"`drift` must be square; got shape {B.shape}.")
 
     def check_state(self, x: State) -> None:
+        require_space(self.space, x)
         n = x.shape[0]
         for name, A, full in (
             ("drift", self.drift_operator, f"({n}, {n})"),

@@ -10,13 +10,18 @@ import itertools
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from .._checks import as_float, positive_integer, require, require_finite, require_positive
 from .._linalg import add, cholesky, safe_sqrt
 from ..kernels import AbstractKernel
+
+_LOST = 0.5
+"""A wrong part of a(x, x) from which on spectral noise is NaN; at the edge of a box half of a(x, x) is lost."""
 
 
 class AbstractNoise(eqx.Module):
@@ -35,6 +40,18 @@ class AbstractNoise(eqx.Module):
         """σ and σσᵀ at the points."""
         sigma = self.factor(kernel, covariance, points)
         return sigma, sigma @ sigma.T
+
+    def misfit(self, kernel, covariance, points: Float[Array, "q d"]) -> Float[Array, ""]:
+        """By what part of a(x, x) the law at the points is wrong because they are too wide or too near an edge."""
+        return jnp.zeros((), points.dtype)
+
+    def room(self, kernel, covariance, points: np.ndarray) -> str:
+        """Where points must lie, in words and numbers, and the cure."""
+        raise NotImplementedError
+
+    def error(self, kernel, covariance, dim: int, points: Float[Array, "s q d"] | None) -> dict[str, Array]:
+        """What the representation gets wrong, relative to a(x, x): at the worst of s states, or for any state."""
+        return {}
 
 
 class LandmarkNoise(AbstractNoise):
@@ -77,8 +94,9 @@ class SpectralNoise(AbstractNoise):
     **Arguments:**
 
     - `num_modes`: largest frequency per axis; (2 num_modes + 1)^dim noises per coordinate.
-    - `period`: P, which must exceed the diameter of the shapes: the wrap-around is a(P − diameter). By default
-      `diameter + 8.6 length_scale` for the Gaussian kernel's length scale (wrap-around 1e-8).
+    - `period`: P, which must exceed the extent of the shapes along each axis: the wrap-around is a(P − extent). By
+      default `diameter + 8.6 length_scale` for the Gaussian kernel's length scale (wrap-around 1e-8). Where the
+      wrap-around exceeds half of a(x, x) the noise is NaN.
     - `diameter`: of the shapes that the flow may reach, used by the default period.
     """
 
@@ -113,6 +131,10 @@ class SpectralNoise(AbstractNoise):
         return np.array([(0,) * dim, *half], float)
 
     def factor(self, kernel, covariance, points):
+        fits = self.misfit(kernel, covariance, points) < _LOST
+        return jnp.where(fits, self._series(kernel, covariance, points), jnp.nan)
+
+    def _series(self, kernel, covariance, points):
         dim = points.shape[1]
         period = self._period(kernel, covariance)
         omega = jnp.asarray(self._lattice(dim), points.dtype) * (2 * jnp.pi / period)
@@ -121,25 +143,45 @@ class SpectralNoise(AbstractNoise):
         phase = points @ omega.T
         return jnp.concatenate([scale[None] * jnp.cos(phase), (scale[None] * jnp.sin(phase))[:, 1:]], axis=1)
 
-    def error(self, kernel, covariance, dim: int) -> dict[str, Array]:
-        """What the representation leaves out, relative to a(x, x): the truncated `tail` (variance missing at a point)
-        and the `wrap_around` (covariance with the nearest periodic image, at the given diameter)."""
+    def misfit(self, kernel, covariance, points):
+        extent = jnp.max(jnp.max(points, axis=0) - jnp.min(points, axis=0))
+        return self._wrap_around(kernel, covariance, points.shape[1], lax.stop_gradient(extent))
+
+    def room(self, kernel, covariance, points):
+        extent = np.max(np.ptp(points, axis=0))
         period = self._period(kernel, covariance)
+        return (
+            f"its extent along an axis, {extent:.4g}, must stay below the `period` of `SpectralNoise`, {period:.4g}, "
+            "by several length scales of the covariance. Give "
+            f"`SpectralNoise(num_modes, diameter={1.5 * extent:.2g})` with more modes in proportion and without a "
+            "`period`, or scale the shapes"
+        )
+
+    def _wrap_around(self, kernel, covariance, dim: int, extent) -> Array:
+        """The covariance of two points at the ends of a shape with each other's periodic image."""
+        period = self._period(kernel, covariance)
+        gap = jnp.maximum(period - extent.astype(period.dtype), 0)
+        origin = jnp.zeros((1, dim), gap.dtype)
+        return covariance.matrix(origin, origin.at[0, 0].set(gap))[0, 0] / covariance.matrix(origin, origin)[0, 0]
+
+    def error(self, kernel, covariance, dim, points):
+        """The truncated `tail` (variance missing at a point), and the `wrap_around`, at the given diameter or for the
+        states."""
         origin = jnp.zeros((1, dim))
         variance = covariance.matrix(origin, origin)[0, 0]
-        factor = self.factor(kernel, covariance, origin)
-        image = origin.at[0, 0].set(period - self.diameter)
-        return {
-            "tail": 1 - jnp.sum(factor**2) / variance,
-            "wrap_around": covariance.matrix(origin, image)[0, 0] / variance,
-        }
+        factor = self._series(kernel, covariance, origin)
+        if points is None:
+            wrap_around = self._wrap_around(kernel, covariance, dim, self.diameter)
+        else:
+            wrap_around = jnp.max(jax.vmap(lambda p: self.misfit(kernel, covariance, p))(points))
+        return {"tail": 1 - jnp.sum(factor**2) / variance, "wrap_around": wrap_around}
 
 
 class GridNoise(AbstractNoise):
     """Quadrature of ∫ k(x, y) dW(y) on the cells of a box, σ_y(x) = k(x, y) √|cell|.
 
     The weight is the square root of the cell's volume: without it the noise grows as the grid is refined.
-    Right for points at least about three length scales inside the box.
+    Right for points at least about three length scales inside the box; NaN outside of it.
 
     **Arguments:** `lower`, `upper`: corners of the box, scalars or `(dim,)`; `num_cells`: cells per axis.
     """
@@ -163,6 +205,11 @@ class GridNoise(AbstractNoise):
         self.num_cells = positive_integer(num_cells, "num_cells")
 
     def factor(self, kernel, covariance, points):
+        sigma = self._quadrature(kernel, points, self.num_cells)
+        inside = jnp.all((points >= self.lower.astype(points.dtype)) & (points <= self.upper.astype(points.dtype)))
+        return jnp.where(inside, sigma, jnp.nan)
+
+    def _quadrature(self, kernel, points, num_cells: int):
         if kernel is None:
             raise ValueError(
                 '`noise="grid"` needs the flow\'s `kernel`; with `covariance=` use "landmark" or "spectral".'
@@ -173,10 +220,34 @@ class GridNoise(AbstractNoise):
             corners <= {(), (dim,)},
             f"`lower` and `upper` must be numbers or corners ({dim},) of a box; got shapes {sorted(corners)}.",
         )
-        width = jnp.broadcast_to((self.upper - self.lower) / self.num_cells, (dim,))
-        index = np.array(list(itertools.product(range(self.num_cells), repeat=dim)), float) + 0.5
+        width = jnp.broadcast_to((self.upper - self.lower) / num_cells, (dim,))
+        index = np.array(list(itertools.product(range(num_cells), repeat=dim)), float) + 0.5
         cells = jnp.broadcast_to(self.lower, (1, dim)) + jnp.asarray(index, points.dtype) * width[None]
         return kernel.matrix(points, cells) * jnp.sqrt(jnp.prod(width))
+
+    def misfit(self, kernel, covariance, points):
+        # of cells half as wide: a coarse grid, whose error is of either sign, is not an edge
+        variance = jnp.sum(self._quadrature(kernel, points, 2 * self.num_cells) ** 2, axis=1)
+        return jnp.maximum(jnp.max(1 - variance / covariance.variance.astype(variance.dtype)), 0)
+
+    def room(self, kernel, covariance, points):
+        corners = [np.array2string(np.asarray(c), precision=4) for c in (self.lower, self.upper)]
+        low, high = (np.array2string(f(points, axis=0), precision=4) for f in (np.min, np.max))
+        return (
+            f"its points, from {low} to {high}, must lie about three length scales inside the box of `GridNoise`, from "
+            f"{corners[0]} to {corners[1]}. Give `GridNoise(lower, upper, num_cells)` a larger one, with cells no "
+            "wider than the length scale, or move and scale the shapes"
+        )
+
+    def error(self, kernel, covariance, dim, points):
+        """At the points of the states: the variance lost at the `edge` of the box, and the whole error of the
+        `quadrature` of a(x, x)."""
+        if points is None:
+            return {}
+        points = points.reshape(-1, dim)
+        found = jnp.sum(self._quadrature(kernel, points, self.num_cells) ** 2, axis=1)
+        quadrature = jnp.max(jnp.abs(1 - found / covariance.variance.astype(found.dtype)))
+        return {"edge": self.misfit(kernel, covariance, points), "quadrature": quadrature}
 
 
 NOISES: dict[str, Callable[[], AbstractNoise]] = {

@@ -2,18 +2,22 @@
 
 import inspect
 from collections.abc import Callable
+from contextlib import contextmanager
+from copy import copy
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+from jaxtyping import Array
 
-from .._checks import require
+from .._checks import floating, require
+from .._closed import Closed, close
 from .._linalg import compose, transpose
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
-from ._base import AbstractSDE, depends_on
+from ._base import AbstractSDE, depends_on, require_space
 
 
 class _Static(eqx.Module):
@@ -26,8 +30,37 @@ class _Static(eqx.Module):
 
 
 def _wrapped(f: Callable) -> Any:
-    """A module keeps its leaves; a plain function becomes static."""
-    return f if isinstance(f, eqx.Module) else _Static(f)
+    """A pytree, such as a module, keeps its leaves; a plain function becomes static."""
+    return _Static(f) if jax.tree_util.all_leaves((f,)) else f
+
+
+@contextmanager
+def _no_escape(name: str):
+    """Says in words what JAX finds: a function that captured a value of a traced program which has ended."""
+    try:
+        yield
+    except jax.errors.UnexpectedTracerError as e:
+        raise ValueError(
+            f"`{name}` captured a value of a traced program that has ended: `jax.vmap`, `jax.jit` or `jax.grad` made "
+            "this SDE from a function that closes over a parameter. Put the parameter into `args`, which "
+            "f(t, x, args) is given, or make it a leaf of an `equinox.Module` that is the function."
+        ) from e
+
+
+class _Coefficient(eqx.Module):
+    """Calls a user's function, or the one of its own where that is a plain one; an array in the state's precision."""
+
+    name: str = eqx.field(static=True)
+    own: _Static | None
+
+    def __call__(self, function: Callable | None, t: RealScalar, x: State, args: Any) -> Array:
+        function = self.own if function is None else function
+        assert function is not None
+        with _no_escape(self.name):
+            value = function(t, x, args)
+        if isinstance(value, lx.AbstractLinearOperator):
+            value = lx.diagonal(value) if lx.is_diagonal(value) else value.as_matrix()
+        return jnp.asarray(floating(value, f"{self.name}(t, x, args)"), x.dtype)
 
 
 class SDE(AbstractSDE):
@@ -35,18 +68,22 @@ class SDE(AbstractSDE):
 
     **Arguments:**
 
-    - `drift`: `f(t, x, args)`, shaped like x.
+    - `drift`: `f(t, x, args)`, shaped like x, for t in [t0, t1].
     - `diffusion`: `f(t, x, args)`: a scalar, a diagonal `(n,)`, a matrix `(n, k)` or a lineax operator. It acts on the
       first axis of the state; k may be smaller (hypo-elliptic) or larger than n.
     - `args`: the parameters, a pytree of arrays. Anything a prior is put on belongs here, or is a leaf of an
       `equinox.Module` passed as `drift` or `diffusion`.
     - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
+
+    Bridges and laws hold what the functions are at the moment when they are made: attributes, globals and closures
+    that the functions read are frozen then, and captured arrays, traced ones too, are differentiated through.
     """
 
-    drift_function: Callable
-    diffusion_function: Callable
+    drift_function: Any
+    diffusion_function: Any
     args: Any
     space: AbstractSpace | None
+    programs: tuple[Closed, Closed] | None
 
     def __init__(self, drift: Callable, diffusion: Callable, args: Any = None, *, space: AbstractSpace | None = None):
         for name, f in (("drift", drift), ("diffusion", diffusion)):
@@ -60,16 +97,32 @@ class SDE(AbstractSDE):
             )
         self.drift_function, self.diffusion_function = _wrapped(drift), _wrapped(diffusion)
         self.args = jax.tree.map(lambda leaf: _parameter(leaf), args)
+        require_space(space)
         self.space = space
+        self.programs = None
+
+    def closed(self, t: RealScalar, x: State) -> "SDE":
+        if self.programs is not None:
+            return self
+        closed = copy(self)
+        programs = []
+        for name, field in (("drift", "drift_function"), ("diffusion", "diffusion_function")):
+            function = getattr(self, field)
+            own = function if isinstance(function, _Static) else None
+            kept = None if own is function else function
+            with _no_escape(name):
+                programs.append(close(_Coefficient(name, own), kept, t, x, self.args))
+            object.__setattr__(closed, field, kept)
+        object.__setattr__(closed, "programs", tuple(programs))
+        return closed
 
     def drift(self, t: RealScalar, x: State) -> State:
-        return jnp.asarray(self.drift_function(t, x, self.args), x.dtype)
+        drift = _Coefficient("drift", None) if self.programs is None else self.programs[0]
+        return drift(self.drift_function, t, x, self.args)
 
     def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
-        sigma = self.diffusion_function(t, x, self.args)
-        if isinstance(sigma, lx.AbstractLinearOperator):
-            sigma = lx.diagonal(sigma) if lx.is_diagonal(sigma) else sigma.as_matrix()
-        sigma = jnp.asarray(sigma, x.dtype)
+        diffusion = _Coefficient("diffusion", None) if self.programs is None else self.programs[1]
+        sigma = diffusion(self.diffusion_function, t, x, self.args)
         require(
             sigma.ndim <= 2,
             f"`diffusion` must return a scalar, a diagonal (n,) or a matrix (n, k); got shape {sigma.shape}.",
@@ -77,7 +130,7 @@ class SDE(AbstractSDE):
         return sigma, compose(sigma, transpose(sigma))
 
     def has_constant_covariance(self, x: State) -> bool:
-        return not depends_on(lambda y: self.noise(0.0, y)[0], x)
+        return not depends_on(lambda t, y: self.noise(t, y)[0], x, 1)
 
 
 def _parameter(leaf: Any) -> jax.Array:

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from .._checks import floating, require
+from .._checks import floating, require, require_instance
 from .._linalg import apply, columns, full_precision, varying_like
 from .._types import Noise, State
 from ._base import AbstractSDE, Displaced
@@ -19,8 +19,11 @@ def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
     **Returns:** `(K + 1, n, dim)`, the first state being `x0`.
     """
     x0, grid = floating(x0, "x0"), given_grid(ts)
-    sde.check_state(x0)
+    require_instance(sde, AbstractSDE, "sde", "an SDE, such as `LinearSDE(drift, diffusion)`")
     times = grid.elapsed.astype(x0.dtype)
+    sde = sde.closed(times[0], x0)
+    sde.check_state(x0)
+    x0 = sde.start(x0)
     shape = (times.shape[0] - 1, sde.noise_size(x0), columns(x0))
     allowed = (shape, shape[:2]) if x0.ndim == 1 else (shape,)
     require(
