@@ -3,8 +3,9 @@
     python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing cell gbm]
 
 One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard error, ESS in percent, k̂
-with the threshold above which the evidence is not to be trusted, seconds of a run without compilation, and seconds per
-effective particle. `reference` is a log evidence from elsewhere: a closed form, or a long run. All in double precision.
+and whether the evidence is to be trusted, seconds of a run without compilation, and seconds per effective particle. A
+standard error is infinite where it is not; `spread` is that of the weights drawn alone, sd(w)/(mean(w) √S).
+`reference` is a log evidence from elsewhere: a closed form, or a long run. All in double precision.
 
 The simulated Kunita cases are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or `../shared/data`.
 """
@@ -104,9 +105,10 @@ def measure(bridge, num_particles: int) -> dict:
         "sd": round(float(log_weights.std()), 3),
         "log_evidence": round(float(estimate.log_evidence), 4),
         "standard_error": round(float(estimate.standard_error), 4),
+        "spread": round(float(np.sqrt(max(num_particles / ess - 1, 0.0) / (num_particles - 1))), 4),
         "ess_percent": round(100 * ess / num_particles, 2),
         "pareto_k": round(estimate.pareto_k, 2),
-        "pareto_k_threshold": round(nb.weights.pareto_k_threshold(num_particles), 2),
+        "trusted": estimate.trusted,
         "seconds": round(run, 2),
         "compile_seconds": round(seconds[0] - run, 2),
         "milliseconds_per_effective_particle": round(1000 * run / ess, 2),

@@ -237,7 +237,10 @@ for parameter in prior:
         print(f"log {parameter:13}{name:7}{row['mean']:8.3f}{row['sd']:8.3f}", end="")
         print(f"{row['ess']:8.0f}{row['ess_per_second']:8.2f}")
 worst = max(abs(z) for row in differences.values() for z in row.values())
+least = min(row[parameter]["ess"] for row in found.values() for parameter in prior)
 verdict = "agree" if worst < 3 else "do not agree"
+if least < 100:
+    verdict = f"have too few draws to compare (an ESS of {least:.0f}, and 100 are needed)"
 print(f"The posteriors {verdict}: means and SDs differ by at most {worst:.1f} joint Monte Carlo errors.")
 
 # %%

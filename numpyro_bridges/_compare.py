@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,15 +14,18 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from . import weights
-from ._checks import positive_integer, require, require_instance
+from ._checks import positive_integer, require, require_instance, require_key
 from ._closed import close
 from ._linalg import apply, full_precision
 from ._types import RealScalar, State
 from .bridges import GuidedBridge
+from .evidence import EvidenceEstimate, driving_noise, timed_estimate
 from .plot._comparison import draw_comparison
 
 _SCORE_PATHS = 64
 _JOINT_ERRORS = 3.0
+_LEAST_ESS = 100.0
+_RESOLUTION = 1.0  # nats: what agrees must not be able to differ by more
 
 
 @dataclass(frozen=True, repr=False)
@@ -35,8 +37,8 @@ class Comparison:
     - `log_evidence` and its `standard_error`, in nats; `rounding`, the part of an estimate that rounding may account
       for, in nats.
     - `ess`, the effective number of particles, and `ess_fraction`, of all particles.
-    - `pareto_k`, −inf where the weights are equal to rounding; `trusted`, whether it is below
-      min(1 − 1/log10(num_particles), 0.7) and the estimate and its standard error are finite.
+    - `pareto_k`, −inf where the weights are equal to rounding; `trusted`, whether the estimate and its standard error
+      can be taken at their word, see `EvidenceEstimate`; `doubt`, why not.
     - `seconds`, the run without compilation, and `training_seconds`; `seconds_per_effective_sample` of the run and
       `seconds_per_effective_sample_with_training` of both.
     - `score_error`, NaN where no score was given.
@@ -45,12 +47,25 @@ class Comparison:
     """
 
     num_particles: int
-    rows: dict[str, dict[str, float | bool]]
+    rows: dict[str, dict[str, Any]]
 
-    def agree(self, first: str, second: str) -> bool:
-        """Whether two log evidences lie within 3 joint standard errors, and rounding. Says nothing of trust."""
+    @classmethod
+    def of(cls, estimates: Mapping[str, EvidenceEstimate]) -> "Comparison":
+        """Of estimates by name, of one evidence and with independent errors. Times are NaN."""
+        rows = {name: _row(estimate, math.nan, 0.0) for name, estimate in estimates.items()}
+        return cls(min(len(estimate.log_weights) for estimate in estimates.values()), rows)
+
+    def agree(self, first: str, second: str) -> bool | None:
+        """Whether two log evidences lie within 3 joint standard errors, and rounding.
+
+        None where that cannot be known: where one of them is not to be trusted, and where the draws are too few,
+        an ESS below 100 or 3 joint standard errors of more than a nat. Weights that are equal to rounding are
+        enough of them, however few.
+        """
+        if self._unknown(first, second):
+            return None
         gap, joint, rounding = self._gap(first, second)
-        return bool(gap <= _JOINT_ERRORS * joint + rounding < math.inf)
+        return bool(gap <= _JOINT_ERRORS * joint + rounding)
 
     @property
     def verdict(self) -> str:
@@ -83,7 +98,9 @@ class Comparison:
         table = [header, *([name, *_cells(row)] for name, row in self.rows.items())]
         if all(math.isnan(row["score_error"]) for row in self.rows.values()):
             table = [line[:-1] for line in table]
-        rule = f"k̂ must be below {_threshold(self.num_particles):.2f}" if self.num_particles > 1 else "k̂ needs more"
+        few = self.num_particles < 2
+        threshold = math.nan if few else weights.pareto_k_threshold(self.num_particles)
+        rule = "k̂ needs more" if few else f"k̂ must be below {threshold:.2f}"
         return "\n".join([*_aligned(table), f"Particles of each: {self.num_particles}; {rule}.", self.verdict])
 
     __repr__ = __str__
@@ -94,27 +111,34 @@ class Comparison:
         joint = math.hypot(a["standard_error"], b["standard_error"])
         return abs(a["log_evidence"] - b["log_evidence"]), joint, a["rounding"] + b["rounding"]
 
+    def _unknown(self, first: str, second: str) -> str:
+        """What keeps two estimates from being compared; empty where nothing does."""
+        names = list(dict.fromkeys((first, second)))
+        if not all(self.rows[name]["trusted"] for name in names):
+            return "cannot be compared"
+        _, joint, _ = self._gap(first, second)
+        few = [n for n in names if self.rows[n]["ess"] < _LEAST_ESS and self.rows[n]["standard_error"] > 0]
+        if few:
+            each = ", ".join(f"{self.rows[name]['ess']:.0f} of {name}" for name in few)
+            return f"have too few draws to compare: an ESS of {each}, and {_LEAST_ESS:.0f} are needed"
+        if _JOINT_ERRORS * joint > _RESOLUTION:
+            return f"have too few draws to compare: {_JOINT_ERRORS:.0f} joint standard errors are {3 * joint:.2g} nats"
+        return ""
+
     def _sentence(self, first: str, second: str) -> str:
         gap, joint, rounding = self._gap(first, second)
-        if not math.isfinite(gap + joint):
-            found = f"cannot be compared: they differ by {gap:.2g} ± {joint:.2g}"
-        elif gap <= rounding:
+        found = self._unknown(first, second)
+        if not found and gap <= rounding:
             found = "agree to rounding"
-        else:
-            found = "agree" if self.agree(first, second) else "do not agree"
+        elif not found:
             errors = gap / joint if joint > 0 else math.inf
+            found = "agree" if self.agree(first, second) else "do not agree"
             found += f": they differ by {gap:.2g}, or {errors:.1f} joint standard errors"
         return f"{first} and {second} {found}.{self._distrust(first, second)}"
 
     def _distrust(self, *names: str) -> str:
-        doubts = [f"{name} ({self._doubt(name)})" for name in names if not self.rows[name]["trusted"]]
+        doubts = [f"{name} ({self.rows[name]['doubt']})" for name in names if self.rows[name]["doubt"]]
         return f" Not to be trusted: {', '.join(doubts)}." if doubts else ""
-
-    def _doubt(self, name: str) -> str:
-        row = self.rows[name]
-        if math.isfinite(row["log_evidence"]) and math.isfinite(row["standard_error"]):
-            return f"k̂ = {row['pareto_k']:.2f}"
-        return f"{row['log_evidence']:.2f} ± {row['standard_error']:.2g}"
 
 
 def compare(
@@ -142,12 +166,13 @@ def compare(
 
       over 64 of the weighted paths (self-normalised) and the steps of the grid, t and x being those at a step's start.
 
-    **Returns:** a `Comparison`. Run times are measured after compilation, one batch after the other.
+    **Returns:** a `Comparison`. Run times are measured after compilation, one bridge after the other.
 
     **Errors:** `ValueError` where the bridges differ in their SDE, condition, start, grid or solver (the continuous
     weight of a diffrax solver has another expectation): there is then no one number to agree on.
     """
     _check_bridges(bridges)
+    require_key(key)
     training_seconds = {} if training_seconds is None else training_seconds
     unknown = sorted(set(training_seconds) - set(bridges))
     require(not unknown, f"`training_seconds` must be of the bridges {sorted(bridges)}; got {unknown} too.")
@@ -155,11 +180,12 @@ def compare(
     batch_size = min(256, num_particles) if batch_size is None else positive_integer(batch_size, "batch_size")
     rows = {}
     for (name, bridge), key_bridge in zip(bridges.items(), jr.split(key, len(bridges)), strict=True):
-        keys = jr.split(key_bridge, num_particles)
-        log_weights, seconds = _timed_log_weights(bridge, keys, batch_size)
+        estimate, seconds = timed_estimate(bridge, key_bridge, num_particles, batch_size)
         trained = float(training_seconds.get(name, _trained_seconds(bridge)))
-        error = math.nan if score is None else _checked_score_error(bridge, score, keys[:_SCORE_PATHS])
-        rows[name] = _row(bridge, log_weights, seconds, trained) | {"score_error": error}
+        keys = jr.split(key_bridge, num_particles)[:_SCORE_PATHS]
+        rows[name] = _row(estimate, seconds, trained)
+        if score is not None:
+            rows[name]["score_error"] = _checked_score_error(bridge, score, keys)
     return Comparison(num_particles, rows)
 
 
@@ -196,60 +222,26 @@ def _trained_seconds(bridge: GuidedBridge) -> float:
     return float(np.asarray(history["seconds"])[-1]) if history else 0.0
 
 
-def _noise(bridge: GuidedBridge, key):
-    return jr.normal(key, bridge.noise_shape, bridge.x0.dtype)
-
-
-@eqx.filter_jit
-def _log_weights(bridge: GuidedBridge, keys):
-    return jax.vmap(lambda key: bridge.log_weight(_noise(bridge, key)))(keys)
-
-
-def _timed_log_weights(bridge: GuidedBridge, keys, batch_size: int) -> tuple[np.ndarray, float]:
-    """Log weights, and the seconds that they took after compilation."""
-    batches = [keys[i : i + batch_size] for i in range(0, len(keys), batch_size)]
-    for batch in {len(batch): batch for batch in batches}.values():
-        jax.block_until_ready(_log_weights(bridge, batch))
-    start = time.perf_counter()
-    found = [jax.block_until_ready(_log_weights(bridge, batch)) for batch in batches]
-    seconds = time.perf_counter() - start
-    return np.concatenate(found), seconds
-
-
-def _row(bridge: GuidedBridge, log_weights: np.ndarray, seconds: float, trained: float) -> dict[str, float | bool]:
-    num_particles = len(log_weights)
-    log_evidence = float(weights.log_mean_exp(log_weights))
-    standard_error = float(weights.standard_error(log_weights))
-    rounding = _rounding(bridge, log_evidence)
+def _row(estimate: EvidenceEstimate, seconds: float, trained: float) -> dict[str, Any]:
+    num_particles = estimate.log_weights.shape[0]
     # one particle has an ESS of 1 and a bounded tail, both without meaning
-    ess = float(weights.effective_sample_size(log_weights)) if num_particles > 1 else math.nan
-    pareto_k = float(weights.pareto_k(log_weights)) if num_particles > 1 else math.nan
-    finite = math.isfinite(log_evidence) and math.isfinite(standard_error)
-    if finite and np.ptp(log_weights) <= 2 * rounding:  # each of two log weights may be off by it
-        pareto_k = -math.inf  # and not the shape of the tail of rounding errors
+    meant = 1.0 if num_particles > 1 else math.nan
+    ess = float(estimate.ess) * meant
     return {
-        "log_evidence": log_evidence,
-        "standard_error": standard_error,
-        "rounding": rounding,
+        "log_evidence": float(estimate.log_evidence),
+        "standard_error": float(estimate.standard_error),
+        "rounding": estimate.rounding,
         "ess": ess,
         "ess_fraction": ess / num_particles,
-        "pareto_k": pareto_k,
-        "trusted": finite and pareto_k < _threshold(num_particles),
+        "pareto_k": estimate.pareto_k * meant,
+        "trusted": estimate.trusted,
+        "doubt": estimate.doubt,
         "seconds": seconds,
         "training_seconds": trained,
+        "score_error": math.nan,
         "seconds_per_effective_sample": seconds / ess if ess else math.inf,
         "seconds_per_effective_sample_with_training": (seconds + trained) / ess if ess else math.inf,
     }
-
-
-def _rounding(bridge: GuidedBridge, log_evidence: float) -> float:
-    """Nats that rounding may cost a log weight: K sums of numbers as large as itself and of all squared noises."""
-    size = math.prod(bridge.noise_shape) + bridge.num_steps * abs(log_evidence)
-    return float(jnp.finfo(bridge.x0.dtype).eps) * size
-
-
-def _threshold(num_particles: int) -> float:
-    return weights.pareto_k_threshold(num_particles) if num_particles > 1 else math.nan
 
 
 def _checked_score_error(bridge: GuidedBridge, score, keys) -> float:
@@ -271,7 +263,7 @@ def _score_error(bridge: GuidedBridge, score, keys):
         return jnp.stack([jnp.sum(u * apply(a, u)) for u in (s - s_exact, s_exact)])
 
     def integrals(key):
-        path, log_weight = bridge.path_and_log_weight(_noise(bridge, key))
+        path, log_weight = bridge.path_and_log_weight(driving_noise(bridge, key))
         along = jax.vmap(squares)(bridge.ts[:-1], path[:-1], bridge.scores(path))
         return jnp.diff(bridge.grid.elapsed) @ along, log_weight
 

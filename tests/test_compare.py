@@ -2,6 +2,7 @@
 
 import builtins
 import math
+import re
 
 import diffrax
 import jax
@@ -83,7 +84,7 @@ def test_errors_are_independent():
     """Two bridges that are one differ by their noise, which has the spread of the joint standard error."""
     gaps = []
     for seed in range(40):
-        pair = nb.compare({"a": BROWNIAN, "b": BROWNIAN}, jr.key(seed), num_particles=200)
+        pair = nb.compare({"a": BROWNIAN, "b": BROWNIAN}, jr.key(seed), num_particles=2500)
         a, b = pair.rows.values()
         gaps.append((a["log_evidence"] - b["log_evidence"]) / math.hypot(a["standard_error"], b["standard_error"]))
     # the sum of squares is chi-squared with 40 degrees of freedom, but for one failure in 1000
@@ -156,7 +157,48 @@ def test_a_heavy_tail_is_not_trusted():
     found = nb.compare({"exact": EXACT, "poor": POOR}, jr.key(0), num_particles=500)
     row = found.rows["poor"]
     assert row["pareto_k"] >= nb.weights.pareto_k_threshold(500) and not row["trusted"]
-    assert f"Not to be trusted: poor (k̂ = {row['pareto_k']:.2f})." in found.verdict
+    assert row["standard_error"] == math.inf and found.agree("exact", "poor") is None
+    doubt = f"Not to be trusted: poor (k̂ = {row['pareto_k']:.2f}, and must be below 0.70)."
+    assert found.verdict == f"exact and poor cannot be compared. {doubt}"
+
+
+def row(log_evidence, standard_error, ess=500.0, doubt=""):
+    return {
+        "log_evidence": log_evidence,
+        "standard_error": standard_error,
+        "rounding": 1e-12,
+        "ess": ess,
+        "trusted": not doubt,
+        "doubt": doubt,
+    }
+
+
+EQUAL = row(1.0, 0.0, ess=20.0)
+PAIRS = [
+    ("near", row(1.0, 0.1), row(1.4, 0.1), True, "agree: they differ by 0.4, or 2.8 joint"),
+    ("far", row(1.0, 0.1), row(1.5, 0.1), False, "do not agree: they differ by 0.5, or 3.5"),
+    ("untrusted", row(1.0, 0.1), row(1.0, 0.1, doubt="why"), None, "cannot .*Not .*: second \\(why\\)"),
+    ("few", row(1.0, 0.1), row(1.0, 0.1, ess=99.4), None, "too few draws .* ESS of 99 of second, and 100"),
+    ("far-and-few", row(1.0, 0.1, ess=5.0), row(9.0, 0.1), None, "too few draws .* ESS of 5 of first"),
+    ("blurred", row(1.0, 0.3), row(1.0, 0.3), None, "too few draws .* 3 joint standard errors are 1.3 nats"),
+    ("rounding", EQUAL, row(1.0 + 1e-12, 0.0, ess=20.0), True, "agree to rounding"),
+    ("beyond-rounding", EQUAL, row(1.0 + 1e-11, 0.0, ess=20.0), False, "do not agree: they differ by 1e-11"),
+    ("one-equal", EQUAL, row(1.1, 0.1), True, "agree: "),
+    ("one-equal-few", EQUAL, row(1.0, 0.1, ess=20.0), None, "too few draws .* ESS of 20 of second"),
+]
+
+
+@pytest.mark.parametrize(("first", "second", "agree", "said"), [pytest.param(*c, id=n) for n, *c in PAIRS])
+def test_what_can_be_said_of_two(first, second, agree, said):
+    """Symmetric, and never an agreement of what is not known."""
+    found = nb.Comparison(20, {"first": first, "second": second})
+    assert found.agree("first", "second") is agree and found.agree("second", "first") is agree
+    assert re.match(f"first and second (have )?{said}", found.verdict), found.verdict
+
+
+def test_a_quick_run_says_that_it_is_one():
+    found = nb.compare({"a": BROWNIAN, "b": BROWNIAN}, jr.key(0), num_particles=50)
+    assert found.agree("a", "b") is None and "a and b have too few draws to compare" in str(found)
 
 
 def test_one_particle_is_not_trusted():
@@ -166,7 +208,8 @@ def test_one_particle_is_not_trusted():
         assert all(math.isnan(row[name]) for name in hidden) and not row["trusted"]
     assert not found.agree("exact", "brownian") and not found.agree("exact", "exact")
     assert "exact and brownian cannot be compared" in found.verdict
-    assert "Not to be trusted: exact (" in found.verdict and "± nan), brownian (" in found.verdict
+    assert "Not to be trusted: exact (a single particle has no" in found.verdict
+    assert found.agree("exact", "brownian") is None
 
 
 @pytest.mark.parametrize(("weight", "shown"), [(np.nan, "nan"), (-np.inf, "-inf")])
@@ -181,7 +224,7 @@ def test_failed_weights_are_seen(monkeypatch, weight, shown):
     assert str(row["log_evidence"]) == shown and not row["trusted"] and not found.agree("right", "failed")
     assert not math.isfinite(row["seconds_per_effective_sample"])
     assert "right and failed cannot be compared" in found.verdict
-    assert f"Not to be trusted: failed ({shown} ±" in found.verdict
+    assert f"Not to be trusted: failed (the log evidence is {shown})" in found.verdict
 
 
 class TrainedGuide(nb.AbstractGuide):

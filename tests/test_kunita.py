@@ -150,7 +150,8 @@ def test_simulated_targets(simulated_targets, target):
     receding, frozen = (x[target] for x in simulated_targets)
     value, own = REFERENCE[target]
     found = float(nb.weights.log_mean_exp(receding))
-    error = float(nb.weights.standard_error(receding))
+    weight = np.exp(receding - found)
+    error = weight.std(ddof=1) / np.sqrt(weight.size)  # of the weights drawn: the tails of some are not to be trusted
     k = float(nb.weights.pareto_k(receding))
     print(f"log evidence {found:.2f} ± {error:.2f}, k {k:.2f}, SD {receding.std():.2f} and {frozen.std():.2f}")
     assert error < 0.2

@@ -16,11 +16,32 @@ STATISTICS = [weights.effective_sample_size, weights.standard_error, weights.par
 
 
 def extended(log_weights):
-    """Log mean, ESS and standard error in extended precision."""
+    """Log mean, ESS, and standard error in extended precision: of the weights drawn, and of those missed."""
     log_weights = np.asarray(log_weights, np.longdouble)
     w = np.exp(log_weights - log_weights.max())
     log_mean = log_weights.max() + np.log(w.mean())
-    return log_mean, w.sum() ** 2 / (w**2).sum(), w.std(ddof=1) / (w.mean() * np.sqrt(np.longdouble(w.size)))
+    drawn = w.std(ddof=1) / (w.mean() * np.sqrt(np.longdouble(w.size)))
+    return log_mean, w.sum() ** 2 / (w**2).sum(), np.hypot(drawn, missing(w) / w.mean())
+
+
+def missing(w):
+    """σ n^κ / ((1 − κ)² S) of a tail fitted as Zhang and Stephens (2009) have it."""
+    length = math.ceil(min(w.size / 5, 3 * math.sqrt(w.size)))
+    ordered = np.sort(w)
+    y = ordered[-length:] - ordered[-length - 1]
+    y = y[y > 0]
+    n = y.size
+    m = 30 + math.isqrt(length)
+    b = 1 / y[-1] + (1 - np.sqrt(m / (np.arange(m) + np.longdouble(0.5)))) / (3 * y[(n + 2) // 4 - 1])
+    k = np.mean(np.log1p(-b[:, None] * y), axis=1)
+    log_likelihood = n * (np.log(np.abs(b / k)) - k - 1)
+    b = np.average(b, weights=np.exp(log_likelihood - log_likelihood.max()))
+    k = np.mean(np.log1p(-b * y))
+    scale, k = np.abs(k / b), (n * k + 5) / (n + 10)
+    raised = k + (1 + max(k, 0)) / np.sqrt(np.longdouble(n))
+    if k >= 0.7 or raised >= 1:
+        return np.inf
+    return scale * n**raised / (1 - raised) ** 2 / w.size
 
 
 def arviz_k(log_weights):
@@ -36,13 +57,18 @@ def arviz_k(log_weights):
     return float(array_stats.psislw(-np.asarray(log_weights))[1])
 
 
+@pytest.mark.parametrize("scale", [0.5, 1.5, 3.0])
 @pytest.mark.parametrize("shift", SHIFTS)
-def test_extended_precision(key, shift):
-    log_weights = shift + 3 * jr.normal(key, (1000,))
+def test_extended_precision(key, shift, scale):
+    log_weights = shift + scale * jr.normal(key, (1000,))
     log_mean, ess, error = extended(log_weights)
     assert abs(weights.log_mean_exp(log_weights) - float(log_mean)) < 1e-14 * max(abs(shift), 100)
     np.testing.assert_allclose(weights.effective_sample_size(log_weights), float(ess), rtol=1e-11)
-    np.testing.assert_allclose(weights.standard_error(log_weights), float(error), rtol=1e-11)
+    np.testing.assert_allclose(weights.standard_error(log_weights), float(error), rtol=1e-8)
+    assert scale < 3 or error == np.inf
+    together = weights.quality(log_weights)
+    for statistic, value in zip(["standard_error", "effective_sample_size", "pareto_k"], together, strict=True):
+        np.testing.assert_allclose(value, getattr(weights, statistic)(log_weights), rtol=1e-12)
 
 
 @pytest.mark.parametrize("shift", SHIFTS)
@@ -55,7 +81,7 @@ def test_equal_weights(shift):
 
 
 def test_standard_error_is_the_spread_of_the_estimate():
-    log_weights = 0.5 * jr.normal(jr.key(1), (4000, 500))
+    log_weights = jnp.log(jr.uniform(jr.key(1), (4000, 500), minval=0.01))  # no tail, of which to miss something
     estimates = weights.log_mean_exp(log_weights)
     # the standard deviation of 4000 estimates has a relative error of 1.1 %
     np.testing.assert_allclose(weights.standard_error(log_weights).mean(), estimates.std(), rtol=0.045)
@@ -100,7 +126,7 @@ def test_zero_weights(key):
     log_mean, ess, error = extended(some)
     np.testing.assert_allclose(weights.log_mean_exp(some), float(log_mean), rtol=1e-12)
     np.testing.assert_allclose(weights.effective_sample_size(some), float(ess), rtol=1e-12)
-    np.testing.assert_allclose(weights.standard_error(some), float(error), rtol=1e-12)
+    np.testing.assert_allclose(weights.standard_error(some), float(error), rtol=1e-8)
 
     none = jnp.full((100,), -jnp.inf)
     assert weights.log_mean_exp(none) == -jnp.inf
@@ -140,8 +166,34 @@ def test_single_precision_stays_single(key):
         np.testing.assert_allclose(value, statistic(log_weights.astype(jnp.float64)), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("statistic", [weights.log_mean_exp, weights.quality, *STATISTICS])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ([], "at least one particle along axis -1; got shape \\(0,\\)"),
+        (np.zeros((3, 0)), "at least one particle along axis -1; got shape \\(3, 0\\)"),
+        (0.5, "at least one particle along axis -1; got shape \\(\\)"),
+        ("0.5", "number"),
+        (["a", "b"], "number"),
+        (None, "number"),
+        ([True, False], "number"),
+        ([1j, 2.0], "number"),
+    ],
+)
+def test_what_is_no_array_of_particles_is_refused(statistic, value, message):
+    with pytest.raises(ValueError, match=f"`log_weights` must .*{message}"):
+        statistic(value)
+
+
+def test_whole_numbers_are_weights():
+    np.testing.assert_allclose(weights.log_mean_exp([0, 1]), np.log((1 + np.e) / 2), rtol=1e-12)
+    with pytest.raises(ValueError, match="along axis 1; got shape"):
+        weights.log_mean_exp(np.zeros(3), axis=1)
+
+
 def test_threshold():
-    assert weights.pareto_k_threshold(100) == 0.5
-    assert weights.pareto_k_threshold(10**6) == 0.7
-    with pytest.raises(ValueError, match="`num_particles` must be at least 2, got 1"):
+    root = math.sqrt(20)  # 100 particles have a tail of 20
+    assert weights.pareto_k_threshold(100) == pytest.approx((root - 1) / (root + 1))
+    assert weights.pareto_k_threshold(160) < 0.7 == weights.pareto_k_threshold(np.int64(161))
+    with pytest.raises(ValueError, match="`num_particles` must be an integer, at least 2; got 1"):
         weights.pareto_k_threshold(1)
