@@ -5,7 +5,9 @@ differences, and identities that hold for any density.
 """
 
 import functools
+import re
 import sys
+import warnings
 
 import equinox as eqx
 import jax
@@ -23,12 +25,16 @@ import numpyro_bridges as nb
 from numpyro_bridges.guiding._score import Standard
 from numpyro_bridges.scores import ScoreGuide, _training as training_module
 from numpyro_bridges.scores._clouds import adjoint_cloud, ends, forward_cloud, reversal_cloud, reversed_bridge
-from numpyro_bridges.scores._fit import Problem, adjoint, residual
+from numpyro_bridges.scores._fit import Problem, _gain, adjoint, residual
 from numpyro_bridges.scores._reversed import ReversedSDE
 from numpyro_bridges.scores._training import train
 from numpyro_bridges.sdes import AbstractSDE
 
-pytestmark = pytest.mark.usefixtures("compile_quickly")
+pytestmark = [
+    pytest.mark.usefixtures("compile_quickly"),
+    # trainings of a few updates, whose gain is not what is tested
+    pytest.mark.filterwarnings("ignore:.*brought nothing:UserWarning"),
+]
 
 # Clouds.
 
@@ -516,6 +522,37 @@ def test_training_is_watched():
     np.testing.assert_array_equal(seen[-1][0], network)
 
 
+SPREAD = 0.2 * np.sqrt(64) * scipy.stats.zscore(np.random.default_rng(0).normal(size=64), ddof=1)
+GAINS = {
+    # value of the guide, its bounds, those of the network, what is said
+    "nothing-to-learn": (np.inf, 5.0, 5.0 + 0 * SPREAD, "brought nothing: the weights of the guide are equal"),
+    "kept": (5.0, 5.0, 5.0 + 0 * SPREAD, "brought nothing: no network was better than the guide alone"),
+    "within-its-error": (5.0, 5.0, 5.3 + SPREAD, "brought nothing: .* is 0.3 ± 0.2 nats above .*ESS 60 % .50 %."),
+    "lower": (5.0, 5.0, 4.0 + SPREAD, "brought nothing: its bound is -1 ± 0.2 nats above"),
+    "few": (5.0, 5.0, 6.0 + SPREAD[:8], "may have brought nothing: 8 .* differences are too few to tell"),
+    "gain": (5.0, 5.0, 6.0 + SPREAD, None),
+    "a-guide-that-fails": (-np.inf, np.nan, 6.0 + SPREAD, None),
+    "both-fail": (-np.inf, np.nan, np.nan * SPREAD, "brought nothing: its bound is nan"),
+}
+
+
+@pytest.mark.parametrize(("value", "guide", "network", "said"), GAINS.values(), ids=GAINS)
+def test_what_training_has_brought(value, guide, network, said):
+    """The mean of the differences, path by path, and its standard error; a warning where it is nothing."""
+    before = jnp.array(value), jnp.array(guide), jnp.array(0.5), jnp.full(network.size, guide)
+    after = jnp.zeros(()), jnp.mean(network), jnp.array(0.6), jnp.asarray(network)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = _gain("residual", before, after)
+    assert len(caught) == (said is not None)
+    if said is not None:
+        assert re.match(f"residual {said}", str(caught[0].message)), caught[0].message
+    np.testing.assert_allclose(found["gain"], network.mean() - guide, atol=1e-12)
+    known = network.size >= 16 and np.isfinite(guide)
+    error = network.std(ddof=1) / np.sqrt(network.size) if known else np.nan
+    np.testing.assert_allclose(found["gain_error"], error, rtol=1e-12)
+
+
 # Networks.
 
 
@@ -619,15 +656,17 @@ QUICK = nb.scores.Training(10, 8, interval=5, held_out=8)
 
 @pytest.mark.parametrize("method", ["residual", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)])
 def test_an_exact_guide_is_not_spoilt(method):
-    """Weights stay constant: Brownian motion and its own guide."""
+    """Weights stay constant: Brownian motion and its own guide; and it is said that there was nothing to learn."""
     sde, match = nb.LinearSDE(-0.5, 0.4, 0.3), nb.InexactMatch(0.1).at([0.3])
     if method == "reversal":
         sde, match = nb.BrownianMotion(0.5), nb.ExactMatch().at([0.3])
     small = nb.scores.MLP((1, 1), key=jr.key(1), width=4, depth=1)
-    score = nb.scores.fit(
-        sde, match, x0=[0.0], t1=1.0, num_steps=4, key=jr.key(0), method=method, network=small, training=QUICK,
-        progress=False,
-    )  # fmt: skip
+    with pytest.warns(UserWarning, match=f"{method} brought nothing: .*nothing to learn"):
+        score = nb.scores.fit(
+            sde, match, x0=[0.0], t1=1.0, num_steps=4, key=jr.key(0), method=method, network=small, training=QUICK,
+            progress=False,
+        )  # fmt: skip
+    assert abs(score.history["gain"]) < 1e-10
     bridge = nb.GuidedBridge(sde, match, x0=[0.0], t1=1.0, num_steps=4)
     z = jr.normal(jr.key(1), (50, *bridge.noise_shape))
     found = jax.jit(jax.vmap(bridge.with_guide(score).log_weight))(z)
@@ -730,6 +769,9 @@ def test_the_sine_bridge(method):
     print(method, truth, weight.mean(), error, ess, score.history["bound"])
     assert error < 0.1 and abs(weight.mean() - 1) < 3 * error
     assert ess[1] > 20 * ess[0]
+    gained, own = (log_weight - plain).mean(), (log_weight - plain).std() / np.sqrt(len(plain))
+    gain, error = score.history["gain"], score.history["gain_error"]
+    assert 0 < error < 0.1 * gain and abs(gain - gained) < 4 * np.hypot(error, own)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@
   bridge (Heng, De Bortoli, Doucet and Thornton 2021), twice reversed.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -16,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from .. import weights
@@ -30,6 +32,8 @@ from ..spaces import Landmarks
 from ._clouds import Cloud, adjoint_cloud, ends, forward_cloud, reversal_cloud, reversed_bridge, whiten
 from ._networks import MLP, ROWWISE, PointNetwork, over_batch
 from ._training import Training, train
+
+_LEAST_HELD_OUT = 16  # independent differences: with fewer their standard error is itself unknown
 
 Draw = Callable[[PRNGKeyArray], tuple[AbstractSDE, AbstractCondition, State]]
 
@@ -71,7 +75,10 @@ def fit(
         bridge.with_guide(score)
 
     Its weights are exact whatever was learned, and what is returned is the best network met on held-out paths, the
-    guide as it is included: training does not spoil a guide.
+    guide as it is included: training does not spoil a guide. Nor does it always help: `history["gain"]` is how far the
+    evidence bound lies above that of the guide alone on the same held-out paths, in nats, and `history["gain_error"]`
+    the standard error of that. Where the gain is within two of them a warning says so, and where the held-out paths
+    are too few to tell.
 
     **Arguments:**
 
@@ -250,7 +257,35 @@ def _train(problem: Problem, loss, judge, key, name, *, given, directory, progre
         progress=progress,
         watch=None if watch is None else lambda network, history: watch(name, guide(network, history)),
     )
-    return guide(network, history)
+    return guide(network, history | _gain(name, judge(problem.guide.network), judge(network)))
+
+
+def _gain(name: str, before, after) -> dict[str, Array]:
+    """What training has brought on held-out paths, by what is judged before and after it; a warning if nothing."""
+    if len(before) == 3:  # a time reversal is not a guide, and has no paths of its own
+        return {}
+    differences = np.asarray(after[3] - before[3], float)
+    gain, few = np.mean(differences), differences.size < _LEAST_HELD_OUT
+    error = np.nan if few else np.std(differences, ddof=1) / np.sqrt(differences.size)
+    ess, ess_before = (100 * float(found[2]) for found in (after, before))
+    bounds = f"its bound is {gain:.2g} ± {error:.1g} nats above the guide's, its ESS {ess:.3g} % ({ess_before:.3g} %)"
+    failed = not np.isfinite(before[1]) and np.isfinite(after[1])  # of a guide that fails any network is a gain
+    if bool(before[0] == jnp.inf):
+        said = "brought nothing: the weights of the guide are equal to rounding, and there is nothing to learn"
+    elif not np.any(differences):
+        said = "brought nothing: no network was better than the guide alone, which is kept as it was"
+    elif few:
+        said = (
+            f"may have brought nothing: {differences.size} independent held-out differences are too few to tell, and "
+            f"{_LEAST_HELD_OUT} are needed. Increase `Training(held_out=...)`"
+        )
+    elif not (gain > 2 * error or failed):
+        said = f"brought nothing: {bounds} on held-out paths. Use the guide alone, or train longer or otherwise"
+    else:
+        said = ""
+    if said:
+        warnings.warn(f"{name} {said}.", stacklevel=2)
+    return {"gain": jnp.asarray(gain), "gain_error": jnp.asarray(error)}
 
 
 def _coefficients(problem: Problem, make: Callable[..., Cloud], key: PRNGKeyArray) -> Array:
@@ -319,9 +354,10 @@ def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
 
 
 def _judge(problem: Problem, key: PRNGKeyArray):
-    """E log w, and the ESS fraction, on held-out paths. Weights that do not vary are a perfect guide's: value ∞.
+    """E log w, and the ESS fraction, on held-out paths; and its independent parts, of which it is the mean.
 
-    Noises come in pairs z, −z: what is of first order in the network then cancels from the bound.
+    Weights that do not vary are a perfect guide's: value ∞. Noises come in pairs z, −z: what is of first order in the
+    network then cancels from the bound. A pair is a part, or all of one problem where there are several.
     """
     draws = 16 if problem.amortised else 1
     half = -(-problem.training.held_out // (2 * draws))
@@ -334,14 +370,16 @@ def _judge(problem: Problem, key: PRNGKeyArray):
             noise = jr.normal(key_noise, (half, *bridge.noise_shape), bridge.x0.dtype)
             log_weights = jax.vmap(bridge.log_weight)(jnp.concatenate([noise, -noise]))
             ess = weights.effective_sample_size(log_weights) / (2 * half)
-            return jnp.mean(log_weights), ess, jnp.std(log_weights)
+            pairs = (log_weights[:half] + log_weights[half:]) / 2
+            return pairs, ess, jnp.std(log_weights)
 
-        bounds, ess, spread = jax.vmap(one)(jr.split(key, draws))
-        bound, ess = jnp.mean(bounds), jnp.mean(ess)
+        pairs, ess, spread = jax.vmap(one)(jr.split(key, draws))
+        parts = jnp.mean(pairs, axis=1) if problem.amortised else pairs[0]
+        bound, ess = jnp.mean(parts), jnp.mean(ess)
         value = jnp.where(jnp.isfinite(bound), bound, -jnp.inf)
         perfect = jnp.all(spread < jnp.sqrt(jnp.finfo(spread.dtype).eps))
         value = jnp.where(perfect, jnp.inf, value)
-        return value, bound, ess
+        return value, bound, ess, parts
 
     return judge
 

@@ -112,7 +112,7 @@ class _State(eqx.Module):
 
 
 Loss = Callable[[Any, PRNGKeyArray], tuple[Array, Any]]
-Judge = Callable[[Any], tuple[Array, Array, Array]]
+Judge = Callable[[Any], tuple[Array, ...]]
 
 
 def train(
@@ -131,12 +131,12 @@ def train(
     """The best network, and the history.
 
     `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)`,
-    compiled, a value to be maximised, the bound and the ESS fraction on held-out paths. A network of a better value
-    is kept unless its ESS is less than half of that of the one kept before: the bound E log w is little moved by large
-    weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the same key gives the same network,
-    however often training is resumed from `file`, which is refused where it was written for another `problem` (a pytree
-    of arrays), another key or other settings. `watch(network, history)` is called at each look with the network that
-    was looked at. Seconds are of the updates, compilation apart.
+    compiled, a value to be maximised, the bound and the ESS fraction on held-out paths, and what else it likes. A
+    network of a better value is kept unless its ESS is less than half of that of the one kept before: the bound
+    E log w is little moved by large weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the
+    same key gives the same network, however often training is resumed from `file`, which is refused where it was
+    written for another `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is
+    called at each look with the network that was looked at. Seconds are of the updates, compilation apart.
     """
     optimizer, decay = training.optimizer, training.average
     looks = -(-training.num_updates // training.interval) + 1
@@ -179,7 +179,7 @@ def train(
         return eqx.tree_at(where, state, new), losses
 
     def look(state: _State, loss_value, seconds) -> _State:
-        value, bound, ess = judge(eqx.combine(state.average, static))
+        value, bound, ess, *_ = judge(eqx.combine(state.average, static))
         higher = bool(value > state.best_value)
         better = higher and not bool(ess < state.best_ess / 2)
         better = better or (training.patience is None and bool(value > -jnp.inf))
