@@ -253,8 +253,15 @@ def test_number_of_particles():
     normal = np.random.default_rng(0).normal(0, 1, (256, 4))
     assert _choose([normal], 64) == 2 and _choose([0.1 * normal], 64) == 1
     assert 8 <= _choose([2.0 * normal], 64) <= 64
-    with pytest.warns(UserWarning, match="of 4 particles has a standard deviation of .*: above 1.7 the chain sticks"):
+    with (
+        pytest.warns(UserWarning, match="of 4 particles has a standard deviation of .*: above 1.7 the chain sticks"),
+        pytest.warns(UserWarning, match="too heavy a tail: k̂ is .* on average over the data"),
+    ):
         assert _choose([6.0 * normal], 4) == 4
+    tail = 1.6 * np.random.default_rng(1).exponential(size=(256, 1))  # of a mean that does not exist, and an SD of 1.6
+    for weights in ([tail], [0.1 * normal, tail]):
+        with pytest.warns(UserWarning, match=r"too heavy a tail: k̂ is .* at most 1\.\d.*give `num_particles`"):
+            assert _choose(weights, 64) <= 2
     kernel = CorrelatedPseudoMarginal(conjugate)
     kernel.init(jr.key(0), 10, None, (DATA,), {})
     assert kernel.num_particles in (1, 2, 3)

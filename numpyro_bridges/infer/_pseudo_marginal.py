@@ -23,6 +23,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.special import logsumexp
 
+from .. import weights
 from .._checks import concrete, known_number, positive_integer, require
 from ._kernel import POSITIVE, PROPORTION_OR_0, UNSEALED, AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
@@ -97,12 +98,12 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         if self._num_particles is None:
             with jax.ensure_compile_time_eval():
                 log_weights = self._pilot(model_args, model_kwargs)
-            weights = [concrete(w) for w in log_weights]
+            pilot = [concrete(w) for w in log_weights]
             require(
-                all(w is not None for w in weights),
+                all(w is not None for w in pilot),
                 "`num_particles` must be given where the model's arguments are traced.",
             )
-            self._num_particles = _choose(weights, self._max_particles)
+            self._num_particles = _choose(pilot, self._max_particles)
         return sites
 
     def _pilot(self, model_args, model_kwargs):
@@ -221,7 +222,8 @@ class CorrelatedPseudoMarginal(AbstractPseudoMarginal):
     - `model`: a NumPyro model with sites of driving noise; its other latent sites are continuous parameters.
     - `num_particles`: N, the bridges of each datum. By default it is chosen before the run, the smallest by which the
       log estimate has a standard deviation of at most 1.7 at the mode, where chains are most efficient, with a warning
-      if `max_particles` do not suffice. Where one particle has a standard deviation below 1, the guide is good.
+      if `max_particles` do not suffice, or the weights of 256 bridges have too heavy a tail to tell. Where one particle
+      has a standard deviation below 1, the guide is good.
     - `correlation`: ρ, of the noise of successive proposals.
     - `step_size`: of the walk, in units of the parameters' reference, a Laplace approximation that is renewed in the
       warm-up. By default 2.56 / √d for d parameters (Sherlock, Thiery, Roberts and Rosenthal, 2015).
@@ -254,10 +256,11 @@ class CorrelatedPseudoMarginalMALA(AbstractPseudoMarginal):
 def _choose(log_weights, largest: int) -> int:
     """The smallest number of particles by which the log estimate varies little enough, from pilot weights."""
     rng = np.random.default_rng(0)
-    weights = [np.asarray(w, float) for w in log_weights]
+    pilot = [np.asarray(w, float) for w in log_weights]
+    _warn_of_tails(np.concatenate(pilot, axis=1).T)
     counts = [n for k in range(11) for n in (2**k, 3 * 2**k // 2 if k else 0) if 0 < n <= largest]
     for n in counts:
-        sd = np.std(sum(_resampled(rng, w, n) for w in weights))
+        sd = np.std(sum(_resampled(rng, w, n) for w in pilot))
         if sd <= _BEST_SD:
             return n
     warnings.warn(
@@ -266,6 +269,25 @@ def _choose(log_weights, largest: int) -> int:
         stacklevel=2,
     )
     return counts[-1]
+
+
+def _warn_of_tails(log_weights) -> None:
+    """A warning where weights `(data, bridges)` cannot tell how much a log estimate varies.
+
+    The log forgives more than a mean does, and one k̂ in many is large by chance: their average has to be below 1,
+    beyond which there is no mean to be estimated, and none may be above the threshold by two standard errors.
+    """
+    with jax.ensure_compile_time_eval():
+        shapes = np.clip(np.asarray(weights.pareto_k(log_weights)), 0.0, 2.0)
+    surely = shapes - 2 * (1 + shapes) / np.sqrt(3 * np.sqrt(log_weights.shape[1]))
+    if np.mean(shapes) < 1 and np.max(surely) < weights.pareto_k_threshold(log_weights.shape[1]):
+        return
+    warnings.warn(
+        f"the number of particles is chosen by weights with too heavy a tail: k̂ is {np.mean(shapes):.2f} on average "
+        f"over the data and at most {np.max(shapes):.2f}. The log estimate varies more than they say, and the chain "
+        "may stick. Choose a better guide, or give `num_particles`.",
+        stacklevel=4,
+    )
 
 
 def _resampled(rng, log_weights, n, replicates=500):
