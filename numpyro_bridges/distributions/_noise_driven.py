@@ -267,7 +267,8 @@ class AbstractNoiseDriven(dist.Distribution):
         require(
             broadcasts(shape[:k], self.batch_shape),
             f"`{name}` holds {math.prod(shape[:k])} observations, batch shape {shape[:k]}, for a law of batch "
-            f"{self.batch_shape}. One noise shared by several data is a wrong likelihood: put the site into a `numpyro.plate`.",
+            f"{self.batch_shape}. One noise shared by several data is a wrong likelihood: put the site into a "
+            "`numpyro.plate`.",
         )
         data, mask = concrete(value), True if self._mask is None else concrete(self._mask)
         if data is not None and mask is not None:
