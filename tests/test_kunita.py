@@ -42,6 +42,7 @@ def test_covariance_is_the_integral_over_the_plane():
     np.testing.assert_allclose(found, integral, rtol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:the noise is wrong by more than 1 %")
 @pytest.mark.parametrize("modes, period", [(2, None), (4, None), (7, None), (12, None), (12, 4.5)])
 def test_spectral_covariance(modes, period):
     """Within what the representation says that it leaves out; 1e-8 with the default period and 12 modes."""
