@@ -1,4 +1,4 @@
-"""What tells a chain that goes on from one that starts again: a number of 32 bits, kept in its state.
+"""What tells a chain that goes on from one that starts again: 32 bits, kept in its state.
 
 It is mixed from the arguments of the model and the random key with which the chain continues. Where
 `MCMC.run` gives a warm state a new key, or the model new arguments, the number in the state no
@@ -16,7 +16,7 @@ from jax.core import Tracer
 
 
 def of_arguments(arguments):
-    """Of any pytree: of the bits of its arrays, and of what else it holds in words. Known where the arrays are."""
+    """Of any pytree: its arrays by their bits, the rest by its words. Known where the arrays are."""
     leaves, structure = jax.tree.flatten(arguments)
     arrays = [leaf for leaf in leaves if _has_bits(leaf)]
     others = [leaf for leaf in leaves if not _has_bits(leaf)]
