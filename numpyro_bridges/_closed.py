@@ -20,7 +20,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
 from ._checks import require
-from ._linalg import full_precision
+from ._linalg import full_precision, varying_axes, varying_like
 
 
 class _Program:
@@ -72,8 +72,36 @@ class Closed(eqx.Module):
             "new object from the function itself.",
         )
         leaves = [x.astype(a.dtype) for x, a in zip(leaves, types, strict=True)]
-        (out,) = jaxpr_as_fun(ClosedJaxpr(self.program.jaxpr, self.captured))(*leaves)
+        if any(varying_axes(x) for x in (*leaves, *self.captured)):
+            (out,) = _marked(self.program.jaxpr, self.captured, leaves)
+        else:
+            (out,) = jaxpr_as_fun(ClosedJaxpr(self.program.jaxpr, self.captured))(*leaves)
         return out
+
+
+def _marked(jaxpr: Jaxpr, captured, leaves) -> list:
+    """The outputs of a program, operation by operation, inside `jax.shard_map`.
+
+    Each operation there takes values that vary over the same devices, which the constants of a
+    program that was traced outside do not.
+    """
+    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*captured, *leaves], strict=True))
+
+    def read(variables):
+        return [jnp.asarray(v.val) if isinstance(v, Literal) else values[v] for v in variables]
+
+    for eqn in jaxpr.eqns:
+        inputs = read(eqn.invars)
+        inputs = varying_like(inputs, *inputs)
+        if eqn.primitive.name in ("jit", "pjit"):
+            inner = eqn.params["jaxpr"]
+            outputs = _marked(inner.jaxpr, inner.consts, inputs)
+        else:
+            params = eqn.primitive.get_bind_params(eqn.params)
+            outputs = eqn.primitive.bind(*inputs, **params)
+            outputs = outputs if eqn.primitive.multiple_results else [outputs]
+        values.update(zip(eqn.outvars, outputs, strict=True))
+    return read(jaxpr.outvars)
 
 
 @full_precision

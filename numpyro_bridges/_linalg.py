@@ -33,16 +33,16 @@ def varying_like(carry, *inputs):
     Inside `jax.shard_map` a constant is the same on every device and the loop's result is not: JAX
     wants that said of the carry beforehand. Elsewhere nothing is done.
     """
-    axes = frozenset().union(*(_varying_axes(leaf) for leaf in jax.tree.leaves(inputs)))
+    axes = frozenset().union(*(varying_axes(leaf) for leaf in jax.tree.leaves(inputs)))
 
     def mark(leaf):
-        missing = tuple(sorted(axes - _varying_axes(leaf)))
+        missing = tuple(sorted(axes - varying_axes(leaf)))
         return _mark_varying(leaf, missing) if missing else leaf
 
     return jax.tree.map(mark, carry)
 
 
-def _varying_axes(leaf) -> frozenset:
+def varying_axes(leaf) -> frozenset:
     """Mesh axes along which a value differs from device to device."""
     return getattr(jax.typeof(leaf), "vma", frozenset()) if eqx.is_array(leaf) else frozenset()
 

@@ -1,13 +1,20 @@
 """Derivatives, at ordinary and at special values of the parameters."""
 
+import inspect
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from jax.flatten_util import ravel_pytree
 
+import numpyro_bridges as nb
 from numpyro_bridges._linalg import safe_sqrt
+from numpyro_bridges.guiding._score import Standard
 from numpyro_bridges.sdes._linear import _phi1
+from numpyro_bridges.sdes._noise import AbstractNoise
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
@@ -21,12 +28,33 @@ def slope(f):
 @pytest.mark.parametrize("order", range(4))
 def test_phi_of_every_order(order, dtype):
     """φ₁⁽ʲ⁾(x) = ∫₀¹ sʲ e^{sx} ds by quadrature, through 0 and through the seam at 1."""
-    x = np.array([-30.0, -3.0, -1.001, -1.0, -0.999, -0.1, -1e-6, -1e-20, 0, 1e-9, 1e-3, 0.5, 0.999, 1.0, 1.001, 9.0])
+    x = np.array(
+        [
+            -30.0,
+            -3.0,
+            -1.001,
+            -1.0,
+            -0.999,
+            -0.1,
+            -1e-6,
+            -1e-20,
+            0,
+            1e-9,
+            1e-3,
+            0.5,
+            0.999,
+            1.0,
+            1.001,
+            9.0,
+        ]
+    )
     f = _phi1
     for _ in range(order):
         f = slope(f)
     found = jax.jit(f)(jnp.asarray(x, dtype))
-    truth = [scipy.integrate.quad(lambda s, y=y: s**order * np.exp(s * y), 0, 1, epsabs=0, epsrel=1e-13)[0] for y in x]
+    exactly = {"epsabs": 0, "epsrel": 1e-13}
+    integrals = [scipy.integrate.quad(lambda s, y=y: s**order * np.exp(s * y), 0, 1, **exactly) for y in x]
+    truth = [value for value, _ in integrals]
     np.testing.assert_allclose(found, truth, rtol=1000 * np.finfo(dtype).eps)
 
 
@@ -36,3 +64,179 @@ def test_a_root_at_zero():
     assert jax.grad(lambda y: safe_sqrt(y * y))(0.0) == 0
     np.testing.assert_allclose(jax.grad(safe_sqrt)(2.0), 0.5 / np.sqrt(2), rtol=1e-15)
     assert np.isnan(safe_sqrt(jnp.asarray(-1.0)))
+
+
+TRIANGLE = np.array([[1.0, 0.1], [-0.4, 0.9], [-0.6, -0.8]])
+COINCIDENT = np.array([[1.0], [1.0], [-0.6]])
+B = np.array([[-1.0, 0.3], [0.2, -0.5]])
+"""Parameters of the cases: arrays, in which every entry is differentiated."""
+
+
+def linear(p):
+    return nb.LinearSDE(p["drift"], p["diffusion"], p.get("shift", 0.3))
+
+
+def user(p):
+    return nb.SDE(
+        lambda t, x, a: a[0] * x,
+        lambda t, x, a: a[1] * (1 + 0.1 * x**2),
+        (p["drift"], p["diffusion"]),
+    )
+
+
+def flow(p):
+    return nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(p["amplitude"], p["length_scale"]))
+
+
+def jittered(p):
+    space, noise = nb.Landmarks(3, 2, weights=p["weights"]), nb.LandmarkNoise(p["jitter"])
+    return nb.KunitaFlow(space, covariance=nb.GaussianKernel(p["amplitude"], 0.8), noise=noise)
+
+
+def spectral(p):
+    kernel = nb.GaussianKernel(p["amplitude"], p["length_scale"])
+    return nb.KunitaFlow(nb.Landmarks(3, 1), kernel, noise=nb.SpectralNoise(20, p["period"]))
+
+
+def grid(p):
+    kernel = nb.MaternKernel(p["amplitude"], p["length_scale"])
+    return nb.KunitaFlow(nb.FourierBasis(1, 1), kernel, noise=nb.GridNoise(p["lower"], 5.0, 24))
+
+
+def learned(p):
+    one, none = jnp.ones(()), jnp.zeros(0)
+    base = nb.DriftGuide(nb.FrozenGuide())
+    standard = Standard(one, one, 0 * one, one, none, none)
+    return nb.ScoreGuide(base, lambda t, x, v, theta: p["network"] * jnp.tanh(x) * v, standard)
+
+
+def inexact(p):
+    return nb.InexactMatch(p["variance"], p.get("operator"))
+
+
+PLAIN = {"x0": np.array([0.3, -0.2]), "observed": np.array([1.0, 0.5]), "t1": 1.2, "variance": 0.1}
+SHAPES = {"x0": TRIANGLE, "observed": 1.1 * TRIANGLE, "t1": 1.2, "variance": 0.1, "amplitude": 0.4}
+PAIR = {"x0": COINCIDENT, "observed": COINCIDENT}
+MATRIX = np.array([[1.0, 0.2], [0.2, 0.6]])
+FEW = {name: PLAIN[name] for name in ("x0", "observed", "t1")}
+RATE = {"drift": 0.0, "diffusion": 0.7}
+JITTER = {"weights": np.ones(3), "jitter": 0.0}
+
+
+def no_guide(p):
+    return None
+
+
+def unguided(p):
+    return nb.Unguided()
+
+
+def receding(p):
+    return nb.RecedingGuide(p["end_weight"])
+
+
+def exact(p):
+    return nb.ExactMatch()
+
+
+def bins(p):
+    return nb.IntervalCensored(p["cuts"])
+
+
+def brownian(p):
+    return nb.BrownianMotion(p["Q"])
+
+
+DIAGONAL = {"drift": np.array([0.0, -1.0]), "diffusion": np.array([0.7, 0.0])}
+OPPOSITE = {"drift": np.array([1.0, -1.0]), "diffusion": MATRIX}
+CUTS = {"cuts": np.array([0.1, 0.9])}
+WIDE = {"length_scale": 0.9, "period": 9.5}
+CURVE = {"x0": 0.4 * TRIANGLE[:, :1], "observed": 0.4 * TRIANGLE[:, 1:]}
+BOX = {"length_scale": 0.5, "lower": -4.0}
+RANK_ONE = {"drift": B, "diffusion": B[:, 1:], "operator": np.array([[1.0, 0.5], [0.0, 1.0]])}
+
+CASES = {
+    "no rate": (linear, inexact, no_guide, PLAIN | RATE | {"shift": np.array([1.0, 0.2])}),
+    "no rate, no noise": (linear, inexact, no_guide, PLAIN | DIAGONAL),
+    "opposite rates": (linear, inexact, no_guide, PLAIN | OPPOSITE),
+    "rank one": (linear, inexact, no_guide, PLAIN | RANK_ONE),
+    "learned": (user, inexact, learned, PLAIN | DIAGONAL | {"network": 0.3}),
+    "covariance": (brownian, inexact, no_guide, PLAIN | {"Q": MATRIX, "variance": 0.1 * MATRIX}),
+    "exact": (linear, exact, unguided, FEW | RATE),
+    "bins": (linear, bins, no_guide, FEW | RATE | CUTS),
+    "flow": (flow, inexact, receding, SHAPES | {"length_scale": 0.9, "end_weight": 0.0}),
+    "no jitter": (jittered, inexact, receding, SHAPES | JITTER | {"end_weight": 1.0}),
+    "underflow": (spectral, inexact, no_guide, SHAPES | PAIR | WIDE),
+    "basis": (grid, inexact, no_guide, SHAPES | CURVE | BOX),
+}
+"""What is built: an SDE, a match, a guide; and the parameters."""
+
+
+def bridge_of(name, p):
+    sde, match, guide, _ = CASES[name]
+    condition = match(p).at(np.array([0.0, 1.0]) if match is bins else p["observed"])
+    return nb.GuidedBridge(sde(p), condition, x0=p["x0"], t1=p["t1"], num_steps=2, guide=guide(p))
+
+
+def test_every_public_class_has_a_case():
+    """What can be a part of a bridge is a part of one of the cases."""
+    kinds = (
+        nb.AbstractSDE,
+        nb.AbstractSpace,
+        nb.AbstractKernel,
+        nb.AbstractMatch,
+        nb.AbstractCondition,
+        nb.AbstractGuide,
+        AbstractNoise,
+    )
+    public = {c for c in vars(nb).values() if inspect.isclass(c) and issubclass(c, kinds)}
+    public = {c for c in public if not inspect.isabstract(c)}
+    used = {nb.IntervalCensored}  # a set, once it has its datum
+
+    def visit(part):
+        used.add(type(part))
+        for name in vars(part) if isinstance(part, eqx.Module) else ():
+            visit(getattr(part, name))
+
+    for name, (*_, p) in CASES.items():
+        visit(bridge_of(name, p))
+    assert public <= used
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gradient_of_a_log_weight(name):
+    """By every parameter, both modes, against central differences, and in single precision.
+
+    The differences have an error of 1e-9 here; 1e-5 of each entry is asked for, in single precision
+    2e-3 of the largest.
+    """
+    bridge = bridge_of(name, CASES[name][3])
+    noise = np.random.default_rng(3).normal(size=bridge.noise_shape)
+
+    def problem(dtype):
+        p = jax.tree.map(lambda a: jnp.asarray(a, dtype), CASES[name][3])
+        flat, unravel = ravel_pytree(p)
+        z = jnp.asarray(noise, dtype)
+        return flat, lambda flat: bridge_of(name, unravel(flat)).log_weight(z)
+
+    flat, log_weight = problem(float)
+    one, none = np.eye(flat.size), np.zeros((flat.size, flat.size))
+    points = np.asarray(flat)[None] + 1e-5 * np.concatenate([none, one, -one])
+    directions = np.concatenate([one, none, none])
+
+    @jax.jit
+    def derivatives(flat, points, directions):
+        along = jax.vmap(lambda x, dx: jax.jvp(log_weight, (x,), (dx,)))
+        return jax.grad(log_weight)(flat), *along(points, directions)
+
+    reverse, values, slopes = derivatives(flat, points, directions)
+    _, plus, minus = np.split(np.asarray(values), 3)
+    forward, *_ = np.split(np.asarray(slopes), 3)
+    size = np.max(np.abs(reverse))
+    np.testing.assert_allclose(reverse, (plus - minus) / 2e-5, rtol=1e-5, atol=1e-7 * size)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9 * size)
+    with jax.enable_x64(False):
+        flat, log_weight = problem(np.float32)
+        single = jax.jit(jax.grad(log_weight))(flat)
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, reverse, rtol=0, atol=2e-3 * size)
