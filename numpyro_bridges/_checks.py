@@ -79,9 +79,10 @@ def as_float(x: Any, name: str) -> jax.Array:
 
 
 def floating(x: Any, name: str) -> jax.Array:
-    """An array that keeps its precision; whole numbers become the default float type."""
+    """An array that keeps single and double precision; other numbers become the default float type."""
     x = _real(x, name)
-    keeps = jnp.issubdtype(x.dtype, jnp.floating) and (isinstance(x, jax.Array) or x.itemsize < 8)
+    known_double = not isinstance(x, jax.Array) and x.itemsize > 4  # whose type depends on JAX's settings
+    keeps = jnp.issubdtype(x.dtype, jnp.floating) and x.dtype.itemsize >= 4 and not known_double
     return jnp.asarray(x) if keeps else _converted(x, jnp.result_type(float), name)
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ._checks import as_float, concrete, require, require_finite, require_instance
+from ._checks import as_float, concrete, require, require_finite, require_instance, require_key
 from ._linalg import apply, congruence, full_precision, promote, varying_like
 from ._types import RealScalar, State
 from .conditioning import AbstractCondition, GaussianMessage, Observation, Target
@@ -227,12 +227,12 @@ class GuidedBridge(eqx.Module):
 
     def _split(self, noise):
         """Rows that choose the target, rows that drive the steps; columns dropped for vector states."""
+        noise = as_float(noise, "noise").astype(self.x0.dtype)
         require(
             jnp.shape(noise) == self.noise_shape,
             f"`noise` must have shape {self.noise_shape}, one noise for one path; got {jnp.shape(noise)}. "
             "Use vmap for a batch.",
         )
-        noise = as_float(noise, "noise").astype(self.x0.dtype)
         noise = noise[..., 0] if self.x0.ndim == 1 else noise
         extra = self.condition.num_extra_noises
         return noise[:extra], noise[extra:]
@@ -401,6 +401,8 @@ class GuidedBridge(eqx.Module):
         path = as_float(path, "path").astype(self.x0.dtype)
         shape = (self.num_steps + 1, *self.x0.shape)
         require(path.shape == shape, f"`path` must have shape {shape}; got {path.shape}.")
+        if key is not None:
+            require_key(key)
         self._check_ends(path)
         return self._retrace(path, key)
 

@@ -221,6 +221,10 @@ class IntervalCensored(AbstractMatch):
         numbers = as_float(observed, "observed")
         count = self.cuts.size
         require(
+            numbers.size > 0 and numbers.ndim > 0,
+            f"`observed` must have one bin number per coordinate, (N,) or (N, dim); got shape {numbers.shape}.",
+        )
+        require(
             value is None or np.all((value == np.round(value)) & (value >= 0) & (value <= count)),
             f"`observed` must hold bin numbers from 0 to {count}; got {value}. Values are put into bins by "
             "`numpy.searchsorted(cuts, values)`.",

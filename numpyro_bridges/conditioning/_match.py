@@ -277,7 +277,10 @@ def _is_traced(mask) -> bool:
 
 def _mask(mask) -> Array | np.ndarray:
     """Which rows are seen, as booleans: a NumPy array unless it is traced."""
-    value = jnp.asarray(mask) if _is_traced(mask) else np.asarray(mask)
+    try:
+        value = jnp.asarray(mask) if _is_traced(mask) else np.asarray(mask)
+    except (TypeError, ValueError):  # lists of several lengths, random keys
+        value = np.zeros(1)
     require(
         value.ndim == 1,
         f"`mask` must be a vector (n,), one entry for each row; got shape {value.shape}.",

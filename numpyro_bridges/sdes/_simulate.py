@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from .._checks import floating, require, require_instance
+from .._checks import as_float, floating, require, require_instance
 from .._linalg import apply, columns, full_precision, varying_like
 from .._types import Noise, State
 from ._base import AbstractSDE, Displaced
@@ -18,8 +18,13 @@ def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
 
     **Returns:** `(K + 1, n, dim)`, the first state being `x0`.
     """
-    x0, grid = floating(x0, "x0"), given_grid(ts)
     require_instance(sde, AbstractSDE, "sde", "an SDE, such as `LinearSDE(drift, diffusion)`")
+    x0, grid = floating(x0, "x0"), given_grid(ts)
+    require(
+        x0.ndim in (1, 2) and x0.size > 0,
+        f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Use vmap for a batch.",
+    )
+    noise = as_float(noise, "noise").astype(x0.dtype)
     times = grid.elapsed.astype(x0.dtype)
     sde = sde.closed(times[0], x0)
     sde.check_state(x0)
@@ -30,7 +35,6 @@ def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
         jnp.shape(noise) in allowed,
         f"`noise` must have shape {shape}, one row per step; got {jnp.shape(noise)}. Use vmap for a batch.",
     )
-    noise = jnp.asarray(noise)
     displaced = Displaced(sde, x0, grid.clock(sde, x0).astype(x0.dtype))
 
     def step(y, inputs):
