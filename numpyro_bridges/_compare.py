@@ -14,7 +14,16 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from . import weights
-from ._checks import positive_integer, require, require_instance, require_key
+from ._checks import (
+    choice,
+    known_number,
+    positive_integer,
+    require,
+    require_instance,
+    require_key,
+    require_mapping,
+    words,
+)
 from ._closed import close
 from ._linalg import apply, full_precision
 from ._types import RealScalar, State
@@ -52,6 +61,10 @@ class Comparison:
     @classmethod
     def of(cls, estimates: Mapping[str, EvidenceEstimate]) -> "Comparison":
         """Of estimates by name, of one evidence and with independent errors. Times are NaN."""
+        good = isinstance(estimates, Mapping) and len(estimates) > 0
+        require(good, f"`estimates` must be a dictionary of estimates by name; got {words(estimates)}.")
+        for name, estimate in estimates.items():
+            require_instance(estimate, EvidenceEstimate, f"estimates[{name!r}]", "an `EvidenceEstimate`")
         rows = {name: _row(estimate, math.nan, 0.0) for name, estimate in estimates.items()}
         return cls(min(len(estimate.log_weights) for estimate in estimates.values()), rows)
 
@@ -62,6 +75,8 @@ class Comparison:
         an ESS below 100 or 3 joint standard errors of more than a nat. Weights that are equal to rounding are
         enough of them, however few.
         """
+        choice(first, "first", self.rows)
+        choice(second, "second", self.rows)
         if self._unknown(first, second):
             return None
         gap, joint, rounding = self._gap(first, second)
@@ -173,6 +188,9 @@ def compare(
     """
     _check_bridges(bridges)
     require_key(key)
+    require_mapping(training_seconds, "training_seconds")
+    good = score is None or callable(score)
+    require(good, f"`score` must be a function (t, x) of a time and a state; got {words(score)}.")
     training_seconds = {} if training_seconds is None else training_seconds
     unknown = sorted(set(training_seconds) - set(bridges))
     require(not unknown, f"`training_seconds` must be of the bridges {sorted(bridges)}; got {unknown} too.")
@@ -181,7 +199,8 @@ def compare(
     rows = {}
     for (name, bridge), key_bridge in zip(bridges.items(), jr.split(key, len(bridges)), strict=True):
         estimate, seconds = timed_estimate(bridge, key_bridge, num_particles, batch_size)
-        trained = float(training_seconds.get(name, _trained_seconds(bridge)))
+        trained = training_seconds.get(name, _trained_seconds(bridge))
+        trained = known_number(trained, f"training_seconds[{name!r}]")
         keys = jr.split(key_bridge, num_particles)[:_SCORE_PATHS]
         rows[name] = _row(estimate, seconds, trained)
         if score is not None:

@@ -301,6 +301,9 @@ class GuidedBridge(eqx.Module):
     @_pure_method
     def scores(self, path: Float[Array, "K+1 n *dim"]) -> Float[Array, "K n *dim"]:
         """∇ log h̃ at the grid times, the end left out, from the states of a path: one plan for all of them."""
+        path = as_float(path, "path").astype(self.x0.dtype)
+        shape = (self.num_steps + 1, *self.x0.shape)
+        require(path.shape == shape, f"`path` must have shape {shape}; got {path.shape}. Use vmap for a batch.")
         return self._scores(path)
 
     @eqx.filter_jit

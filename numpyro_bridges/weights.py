@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._checks import floating, positive_integer, require
+from ._checks import floating, positive_integer, require, words
 
 
 def log_mean_exp(log_weights: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
@@ -28,6 +28,7 @@ def log_mean_exp(log_weights: Float[Array, "..."], axis: int = -1) -> Float[Arra
 
     **Returns:** the array without `axis`; `-inf` where every weight is zero.
     """
+    require(hasattr(axis, "__index__"), f"`axis` must be the number of an axis; got {words(axis)}.")
     axis = operator.index(axis)
     return _log_mean_exp(_checked(log_weights, axis), axis)
 

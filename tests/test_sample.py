@@ -424,7 +424,7 @@ def test_errors_name_the_site():
     with pytest.raises(ValueError, match=r"`obs` must have shape \(2,\).*got \(5, 2\).*plate"):
         trace_of(lambda: nb.sample("wing", law(0.3), obs=DATA))
     for wrapped in (dist.Normal(), dist.ExpandedDistribution(law(0.3), (N,))):
-        with pytest.raises(ValueError, match="site `wing`: the law must be driven by noise"):
+        with pytest.raises(ValueError, match="site `wing`: `law` must be driven by noise"):
             trace_of(lambda wrapped=wrapped: nb.sample("wing", wrapped))
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 
-from .._checks import as_float, concrete, require, require_finite, require_instance, words
+from .._checks import as_float, concrete, exact_float, require, require_finite, require_instance, words
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractMatch
@@ -74,6 +74,8 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         x0 = as_float(x0, "x0")
         require_finite(x0, "x0")
         require_instance(sde, AbstractSDE, "sde", "an SDE, such as `LinearSDE(drift, diffusion)`")
+        if guide is not None:
+            require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         batch_shape = as_shape(batch_shape, "batch_shape")
         batched = _names(batched)
         parts = {"sde": sde, "x0": x0, "match": match, "guide": guide}
@@ -81,7 +83,8 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
         datum = jnp.zeros(_seen(one).shape)
         exact = one["match"].at(datum).exact
-        times = {"t0": t0, "t1": t1, "ts": ts}
+        given = {"t0": t0, "t1": t1, "ts": ts}
+        times = {k: value if value is None else exact_float(value, k) for k, value in given.items()}
         parts["ts"], own = _grids(times, batch_shape, num_steps=num_steps, graded=exact)
         names += ("ts",) if own else ()
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))

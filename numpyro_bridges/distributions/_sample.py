@@ -5,7 +5,7 @@ from numpyro import handlers
 from numpyro.infer.reparam import Reparam
 from numpyro.primitives import _PYRO_STACK
 
-from .._checks import require
+from .._checks import require, require_mapping, words
 from ._batch import as_datum
 from ._driving_noise import DrivingNoise, MissingNoise
 from ._noise_driven import AbstractNoiseDriven
@@ -27,6 +27,8 @@ def sample(name: str, law: AbstractNoiseDriven, obs=None, *, infer: dict | None 
 
     **Returns:** the observation.
     """
+    require(isinstance(name, str), f"`name` must be the text that names the site; got {words(name)}.")
+    require_mapping(infer, "infer")
     law, obs = _with_noise(name, law, obs)
     return numpyro.sample(name, law, obs=obs, infer=infer)
 
@@ -45,7 +47,7 @@ def _with_noise(name, law, obs):
     """The law with its noise bound, and the datum as an array."""
     require(
         isinstance(law, AbstractNoiseDriven),
-        f"site `{name}`: the law must be driven by noise, such as `DiffusionEndpoint`; got {type(law).__name__}. "
+        f"site `{name}`: `law` must be driven by noise, such as `DiffusionEndpoint`; got {type(law).__name__}. "
         "Wrap a law by its own methods, `law.expand`, `law.mask` and `law.to_event`, which keep the noise.",
     )
     site = f"{name}_noise"
