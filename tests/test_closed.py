@@ -156,19 +156,26 @@ def test_no_call_compiles_again(counted):
     assert counted[0] <= 2  # programs of other tests may serve
 
 
-@jax.custom_vjp
-def clipped(x, bound):
-    return x
+def reverse_rule(bound):
+    """The identity, with a clipped derivative."""
+    identity = jax.custom_vjp(lambda x: x)
+    identity.defvjp(lambda x: (x, None), lambda _, g: (jnp.clip(g, -bound, bound),))
+    return identity
 
 
-clipped.defvjp(lambda x, bound: (x, bound), lambda bound, g: (jnp.clip(g, -bound, bound), jnp.zeros_like(bound)))
+def forward_rule(bound):
+    identity = jax.custom_jvp(lambda x: x)
+    identity.defjvp(lambda x, dx: (x[0], min(bound, 3.0) / 3 * dx[0]))
+    return identity
 
 
-def test_rules_of_differentiation_tell_programs_apart():
+@pytest.mark.parametrize("rule", [reverse_rule, forward_rule])
+def test_rules_of_differentiation_tell_programs_apart(rule):
     """The value is the same and the derivative is not."""
     x, found = jnp.array([2.0]), []
     for bound in (0.5, 5.0, 0.5):
-        found.append(close(lambda t, x, bound=bound: 3 * clipped(x, bound), 0.0, x))
+        clipped = rule(bound)
+        found.append(close(lambda t, x, clipped=clipped: 3 * clipped(x), 0.0, x))
         slope = jax.grad(lambda x: found[-1](0.0, x).sum())(x)  # noqa: B023
         np.testing.assert_allclose(slope, min(3.0, bound))
     assert found[0].program is found[2].program is not found[1].program
