@@ -8,6 +8,7 @@ ones too, and all else that it reads is frozen at that moment and is a part of w
 
 import pickle
 import weakref
+from collections import deque
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -26,21 +27,30 @@ from ._linalg import full_precision, varying_axes, varying_like
 class _Program:
     """A traced function without the arrays that it captures."""
 
-    def __init__(self, jaxpr: Jaxpr, structure: Any, source: tuple | None):
+    def __init__(self, jaxpr: Jaxpr, structure: Any):
         self.jaxpr = jaxpr
         self.structure = structure
         """Of the arguments, whose arrays are the inputs."""
-        self.source = source
-        """The function and the types of its arguments; `None` where it holds values of a traced program."""
+        self.sources: deque[tuple] = deque(maxlen=8)
+        """The last functions that it was traced from, with the types of their arguments."""
 
     def __reduce__(self):
-        # A jaxpr cannot be pickled. The function can, if it still is what was traced.
-        if self.source is None or close(*self.source).program is not self:
-            raise pickle.PicklingError(
-                "a function cannot be pickled after what it reads has changed, nor where it captures values of a "
-                "traced program. Give it what it reads as arguments, such as `args`."
-            )
-        return _program, self.source
+        # A jaxpr cannot be pickled. A function can, if it has a name and still is what was traced.
+        for source in reversed(tuple(self.sources)):
+            if _is_pickled(source) and close(*source).program is self:
+                return _program, source
+        raise pickle.PicklingError(
+            "a function cannot be pickled where it has no name in a module, after what it reads has changed, and "
+            "where it captures values of a traced program. Give it what it reads as arguments, such as `args`."
+        )
+
+
+def _is_pickled(source: tuple) -> bool:
+    try:
+        pickle.dumps(source)
+    except Exception:  # whatever a user's objects raise
+        return False
+    return True
 
 
 def _program(*source) -> _Program:
@@ -120,11 +130,13 @@ def close(function: Callable, *args) -> Closed:
         key = key, _derivative(traced.jaxpr, [*captured, *leaves], "custom_vjp_call" in rules)
     program = _programs.get(key)
     if program is None:
+        program = _Program(traced.jaxpr, structure)
+        _programs[key] = program
+    if not any(isinstance(c, Tracer) for c in captured):
         types = list(map(_type, traced.jaxpr.invars))
         source = function, *eqx.combine(jax.tree.unflatten(structure, types), static)
-        holds_tracers = any(isinstance(c, Tracer) for c in captured)
-        program = _Program(traced.jaxpr, structure, None if holds_tracers else source)
-        _programs[key] = program
+        if source not in program.sources:
+            program.sources.append(source)
     return Closed(tuple(captured), program)
 
 

@@ -186,6 +186,8 @@ def alternate(names, *choices):
     return [pytest.param(name, c, marks=marks[i % len(choices) == j]) for (i, name), (j, c) in pairs]
 
 
+# Boxes and periods are small, so that the dense replay has few noises.
+@pytest.mark.filterwarnings("ignore:`x0` does not fit the noise")
 @pytest.mark.parametrize("sde, guide", alternate(CURVED, *GUIDES))
 def test_curved_covariance(sde, guide, key):
     check_bridge(*problem(sde, "inexact-operator", guide), key, inverse=guide in ("receding", "drift-receding"))

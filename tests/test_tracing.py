@@ -281,6 +281,9 @@ LEFT_OUT = {
     "Observation": "made by conditions",
     "Target": "made by conditions",
     "AffineStep": "made by SDEs",
+    "Displaced": "made by bridges",
+    "Frame": "made by SDEs",
+    "TimeGrid": "made by bridges",
     "Transition": "made by SDEs",
 }
 ARGUMENTS_LEFT_OUT = {"validate_args"}

@@ -99,7 +99,7 @@ class ScoreGuide(AbstractGuide):
     context: Context | None = eqx.field(static=True, default=None, converter=_context)
     history: dict[str, Array] = eqx.field(default_factory=dict)
     held: Callable | None = None
-    programs: tuple[Closed | None, Closed | None] = (None, None)
+    programs: tuple[Closed | None, Closed | None] = eqx.field(init=False, default=(None, None))
     """Network and context as one bridge holds them, where they are functions that may read more than their leaves."""
 
     def __check_init__(self):
@@ -125,7 +125,9 @@ class ScoreGuide(AbstractGuide):
             v = x.reshape(x.shape[0], -1)
             theta = jnp.zeros(0 if context is None else context.shape, x.dtype)
             network = close(self.network, ts[0], v, v, theta)
-        return replace(self, guide=self.guide.closed(sde, x, ts), programs=(network, context))
+        closed = replace(self, guide=self.guide.closed(sde, x, ts))
+        object.__setattr__(closed, "programs", (network, context))
+        return closed
 
     def plan(self, sde, seen, reference, ts):
         network, context = self.programs

@@ -61,7 +61,7 @@ def _of_bits(bits):
 
 
 def _mixed(x):
-    """The finaliser of MurmurHash3 (Appleby, 2011)."""
+    """The last mixing of MurmurHash3, a bijection of 32 bits."""
     x = (x ^ (x >> np.uint32(16))) * np.uint32(0x85EBCA6B)
     x = (x ^ (x >> np.uint32(13))) * np.uint32(0xC2B2AE35)
     return x ^ (x >> np.uint32(16))
