@@ -226,9 +226,7 @@ def _hashable(value: Any) -> Hashable:
 
 def _rules(value: Any) -> set[str]:
     """The rules that are met in a jaxpr, and in the jaxprs among the parameters of its equations."""
-    if isinstance(value, ClosedJaxpr):
-        return _rules(value.jaxpr)
-    if isinstance(value, Jaxpr):
+    if isinstance(value, (ClosedJaxpr, Jaxpr)):  # one class in later versions of JAX
         found = [_rules(list(eqn.params.values())) | ({eqn.primitive.name} & _RULES) for eqn in value.eqns]
     else:
         found = map(_rules, value) if type(value) in (tuple, list) else []
