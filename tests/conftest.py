@@ -27,6 +27,7 @@ SHORT = ("test_arviz", "test_drive", "test_infer_parts", "test_layers", "test_sa
 def pytest_addoption(parser):
     parser.addoption("--slow", action="store_true", help="run the tests marked slow, which take minutes")
     parser.addoption("--short", action="store_true", help=f"run {', '.join(SHORT)} alone")
+    parser.addoption("--bad-inputs", type=int, help="random bad inputs in all, others in each run (5000: minutes)")
     parser.addoption("--seed", type=int, help="seed of the `key` fixture; by default a new one for each test")
 
 

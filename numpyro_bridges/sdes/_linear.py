@@ -146,6 +146,7 @@ class LinearSDE(AbstractSDE):
         ):
             require_finite(value, name)
             require(value.ndim <= 2, f"`{name}` must be a scalar, a vector or a matrix; got shape {value.shape}.")
+            require(value.size > 0, f"`{name}` must not be empty; got shape {value.shape}.")
         B = self.drift_operator
         require(B.ndim < 2 or B.shape[0] == B.shape[1], f"`drift` must be square; got shape {B.shape}.")
 
