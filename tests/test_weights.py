@@ -65,7 +65,6 @@ def test_extended_precision(key, shift, scale):
     assert abs(weights.log_mean_exp(log_weights) - float(log_mean)) < 1e-14 * max(abs(shift), 100)
     np.testing.assert_allclose(weights.effective_sample_size(log_weights), float(ess), rtol=1e-11)
     np.testing.assert_allclose(weights.standard_error(log_weights), float(error), rtol=1e-8)
-    assert scale < 3 or error == np.inf
     together = weights.quality(log_weights)
     for statistic, value in zip(["standard_error", "effective_sample_size", "pareto_k"], together, strict=True):
         np.testing.assert_allclose(value, getattr(weights, statistic)(log_weights), rtol=1e-12)
