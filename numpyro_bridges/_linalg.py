@@ -44,7 +44,12 @@ def varying_like(carry, *inputs):
 
 def varying_axes(leaf) -> frozenset:
     """Mesh axes along which a value differs from device to device."""
-    return getattr(jax.typeof(leaf), "vma", frozenset()) if eqx.is_array(leaf) else frozenset()
+    if not eqx.is_array(leaf):
+        return frozenset()
+    kind = jax.typeof(leaf)
+    # `vma` up to JAX 0.9, a part of `manual_axis_type` in 0.12
+    manual = getattr(kind, "manual_axis_type", None)
+    return getattr(kind, "vma", frozenset()) if manual is None else manual.varying
 
 
 def _mark_varying(leaf, axes):
