@@ -504,7 +504,30 @@ SCORES = [
     ("learning-rate", lambda: nb.scores.Training(9, learning_rate=0.0), "`learning_rate` must be positive; got 0.0"),
 ]
 
-CASES = SDES + CONDITIONS + BRIDGES + LAWS + SCORES
+
+
+def traced(f, value=0.5):
+    """f in a program, where `value` is traced and constants are known."""
+    return jax.eval_shape(f, jnp.asarray(value))
+
+
+KINDS = [
+    ("traced-complex", lambda: traced(nb.BrownianMotion, 1j), "`covariance` must be a number.*complex128.*real part"),
+    ("traced-boolean", lambda: traced(nb.InexactMatch, True), "`variance` must be a number.*of bool.*astype"),
+    ("traced-in-a-list", lambda: traced(lambda x: bridge(x0=[x, "a", x])), "`x0` must be a number.*Convert text"),
+    ("known-inside", lambda: traced(lambda x: nb.InexactMatch(-0.1)), "`variance` must be positive.*got -0.1"),
+    ("datum-known-inside", lambda: traced(lambda x: nb.InexactMatch(x).at(NAN)), "`observed` must be finite"),
+    ("too-large", lambda: linear(np.longdouble("1e400")), "`drift` must fit into float64; got 1e[+]400.*units"),
+    ("too-large-integer", lambda: linear(10**400), "`drift` must be a number; got 1000.*too large"),
+    ("shapes-traced", lambda: traced(lambda x: nb.shapes.center(x * CURVE)), "`points` must be known before tracing"),
+    ("key-seed", lambda: nb.estimate_evidence(bridge(), 0, 9), "`key` must be a random key, such as `jax.random.key"),
+    ("key-batch", lambda: nb.estimate_evidence(bridge(), jr.split(jr.key(0)), 9), "`key` must be one random key.*keys"),
+    ("flag-text", lambda: nb.InexactMatch(0.1, normalised="False"), "`normalised` must be True or False; got 'False'"),
+    ("file-number", lambda: nb.io.read_csv(0), "`path` must be a path.*got 0"),
+    ("diffusion-empty", lambda: linear(-1.0, np.zeros((3, 0))), r"`diffusion` must not be empty; got shape \(3, 0\)"),
+]
+
+CASES = SDES + CONDITIONS + BRIDGES + LAWS + SCORES + KINDS
 
 
 @pytest.mark.parametrize("make, message", [pytest.param(*case, id=name) for name, *case in CASES])
