@@ -46,12 +46,10 @@ def _(primals, tangents):
     dA, dS, dM, dr, dz = tangents
     out, (N, P, y, g, w) = _forward(A, S, M, r, z)
     F_N, F_P = _factor_change(N, dS), _factor_change(P, dM)
-    # F and Fᵀ in one product, so that F has its cotangent from one product too
-    changed = jnp.concatenate([F_N, F_N.T]) @ jnp.concatenate([y, g], axis=1)
-    (Fy, Fg), (FTy, FTg) = (jnp.split(half, 2, axis=1) for half in jnp.split(changed, 2))
-    dg = solve_lower(N + P, dA @ z + A @ dz - N @ Fg - P @ (F_P @ g))
+    Fy, Fg, FTh = _times(F_N, y), _times(F_N, g), _times(F_N.T, y - g)
+    dg = solve_lower(N + P, dA @ z + A @ dz - N @ Fg - P @ _times(F_P, g))
     dh = solve_lower(N, dr) - Fy - dg
-    dw = solve_lower(N, dh - (FTy - FTg), transposed=True)
+    dw = solve_lower(N, dh - FTh, transposed=True)
     return out, (dz + dA.T @ w + A.T @ dw, jnp.trace(F_P) - jnp.trace(F_N))
 
 
@@ -63,3 +61,8 @@ def _factor_change(L, dS):
     below = jnp.where(i[:, None] > i[None, :], 1.0, 0.0)
     half_of_diagonal = jnp.where(i[:, None] == i[None, :], 0.5, 0.0)
     return X * (below + half_of_diagonal)
+
+
+def _times(F, x):
+    """F x for a few columns, without a `dot`: the transposes, outer products, become one loop over F."""
+    return jnp.sum(F[:, :, None] * x[None, :, :], axis=1)
