@@ -137,6 +137,14 @@ def test_room_is_not_asked_for_twice(noise):
             bridge(flow(noise, nb.GaussianKernel(0.3, ell)), spread(2.0))
 
 
+@pytest.mark.parametrize("noise", [SPECTRAL, nb.GridNoise(-1.0, 1.0)], ids=["spectral", "grid"])
+def test_what_is_known_is_looked_at_inside_a_traced_program(noise):
+    sde, x = flow(noise), spread(5.5)
+    z = np.zeros((2, sde.noise_size(jnp.asarray(spread(1.0))), 1))
+    with pytest.raises(ValueError, match="`x0` does not fit the noise"):
+        jax.jit(lambda z: nb.simulate(sde, x, np.linspace(0, 1, 3), z))(z)
+
+
 def test_a_little_too_narrow_is_a_warning():
     for sde, x in ((flow(SPECTRAL), spread(4.2)), (flow(nb.GridNoise(-2.0, 1.2)), spread(1.0))):
         with pytest.warns(UserWarning, match="`x0` does not fit the noise"):

@@ -8,6 +8,7 @@ Sommer, Schauer, van der Meulen (2021), and Baker et al. (2024), section 2.
 import warnings
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -174,24 +175,35 @@ class KunitaFlow(AbstractSDE):
         self._check_room("x0", x, refuse=True)
 
     def check_end(self, find: Callable[[], State]) -> None:
-        if self.noise_field.fixed_in_space:
+        if self.noise_field.fixed_in_space and _known(self):
             self._check_room("condition", find(), refuse=False)
 
     def _check_room(self, name: str, x: State, refuse: bool) -> None:
         """Where it can be known, says whether the noise has room for a state."""
-        field = (self.kernel, self.covariance_kernel)
-        if concrete(x) is None or not self.noise_field.fixed_in_space:
+        if not self.noise_field.fixed_in_space or not _known((self, x)):
             return
-        points = self.space.to_points(x)
-        lost = concrete(self.noise_field.misfit(*field, points))
-        if lost is None or lost <= _SEEN:
-            return
+        with jax.ensure_compile_time_eval():  # inside a traced program too
+            lost = float(_misfit(self, x))
+            if lost <= _SEEN:
+                return
+            points = np.asarray(self.space.to_points(x))
+            room = self.noise_field.room(self.kernel, self.covariance_kernel, points)
         message = (
             f"`{name}` does not fit the noise, which is wrong there by {100 * lost:.0f} % of a(x, x): "
-            f"{self.noise_field.room(*field, np.asarray(points))}."
+            f"{room}."
         )
         require(not refuse or lost < _REFUSED, message)
         warnings.warn(message, stacklevel=3)
+
+
+def _known(tree) -> bool:
+    return all(concrete(leaf) is not None for leaf in jax.tree.leaves(tree))
+
+
+@eqx.filter_jit
+def _misfit(flow: KunitaFlow, x: State) -> Array:
+    points = flow.space.to_points(x)
+    return flow.noise_field.misfit(flow.kernel, flow.covariance_kernel, points)
 
 
 def _distances(xp, x):

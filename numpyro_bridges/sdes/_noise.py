@@ -161,8 +161,9 @@ class SpectralNoise(AbstractNoise):
         """The covariance of two points at the ends of a shape with each other's periodic image."""
         period = self._period(kernel, covariance)
         gap = jnp.maximum(period - extent.astype(period.dtype), 0)
-        origin = jnp.zeros((1, dim), gap.dtype)
-        return covariance.matrix(origin, origin.at[0, 0].set(gap))[0, 0] / covariance.matrix(origin, origin)[0, 0]
+        ends = gap * np.eye(2, dim, k=-1, dtype=gap.dtype)
+        values = covariance.matrix(ends[:1], ends)[0]
+        return values[1] / values[0]
 
     def error(self, kernel, covariance, dim, points):
         """The truncated `tail` (variance missing at a point), and the `wrap_around`, at the given diameter or for the
