@@ -56,7 +56,7 @@ def _mark_varying(leaf, axes):
     return lax.pcast(leaf, axes, to="varying") if hasattr(lax, "pcast") else lax.pvary(leaf, axes)
 
 
-def _rows(d, x):
+def rows(d, x):
     """A diagonal `d` shaped to scale the rows of `x`."""
     return d.reshape(d.shape + (1,) * (x.ndim - 1))
 
@@ -65,7 +65,7 @@ def apply(A: Structured, x: State) -> State:
     """A x."""
     if A.ndim == 0:
         return A * x
-    return _rows(A, x) * x if A.ndim == 1 else A @ x
+    return rows(A, x) * x if A.ndim == 1 else A @ x
 
 
 def transpose(A: Structured) -> Structured:
@@ -119,8 +119,23 @@ def safe_sqrt(x: Array) -> Array:
 
 
 def cholesky(S: Structured) -> Structured:
-    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite, but for zeros of a diagonal one."""
-    return safe_sqrt(S) if S.ndim < 2 else lax.linalg.cholesky(S, symmetrize_input=False)
+    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite, but for coordinates without variance."""
+    if S.ndim < 2:
+        return safe_sqrt(S)
+    empty = without_variance(S)
+    return jnp.where(empty[:, None], 0.0, lax.linalg.cholesky(filled(S, empty), symmetrize_input=False))
+
+
+def without_variance(S: Structured) -> Array:
+    """Where the diagonal of a covariance, or of its factor, is 0: `()` for a multiple of the identity, else `(m,)`."""
+    return (jnp.diagonal(S) if S.ndim == 2 else S) == 0
+
+
+def filled(S: Structured, empty: Array) -> Structured:
+    """S with variance 1 for the coordinates that have none, which no other coordinate then feels."""
+    if S.ndim < 2:
+        return jnp.where(empty, 1.0, S)
+    return jnp.where(jnp.eye(S.shape[0], dtype=bool) & empty[:, None], 1.0, S)
 
 
 def symmetric(S: Structured) -> Structured:
@@ -131,7 +146,7 @@ def symmetric(S: Structured) -> Structured:
 def solve_lower(C: Structured, x: State, transposed: bool = False) -> State:
     """C⁻¹ x, or C⁻ᵀ x, for a lower triangular C."""
     if C.ndim < 2:
-        return x / (C if C.ndim == 0 else _rows(C, x))
+        return x / (C if C.ndim == 0 else rows(C, x))
     out = lax.linalg.triangular_solve(C, as_columns(x), left_side=True, lower=True, transpose_a=transposed)
     return out.reshape(x.shape)
 

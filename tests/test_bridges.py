@@ -14,7 +14,7 @@ import lineax as lx
 import numpy as np
 import pytest
 from helpers import Condition, Guide, Problem, Process, check_bridge, columns, linear_process
-from models import CONSTANT, CURVED, SDES, X3, Q, R, W
+from models import CONSTANT, CURVE, CURVED, SDES, X3, Q, R, W
 
 import numpyro_bridges as nb
 from numpyro_bridges.guiding._score import Standard
@@ -328,3 +328,46 @@ def test_single_precision():
     assert single.dtype == jnp.float32 and single == default
     np.testing.assert_allclose(single, double, atol=0.05)
     np.testing.assert_allclose(single_gradient, double_gradient, rtol=0.02)
+
+
+MATRIX = np.array([[-1.0, 0.2, 0.0], [0.0, -0.5, 0.0], [0.1, 0.0, -0.3]])
+FLOW = nb.Landmarks(3, 2)
+SOME = nb.ExactMatch(mask=[True, False, True])
+AROUND = nb.CylinderSet([0.9, -np.inf, 0.5], [1.1, np.inf, 3.0])
+DEGENERATE = {
+    "scalar": (lambda c: nb.LinearSDE(-0.5, c), nb.ExactMatch().at(V), X3),
+    "one component": (lambda c: nb.LinearSDE(-0.5, jnp.stack([1.0, c, 1.0])), nb.ExactMatch().at(V), X3),
+    "some rows": (lambda c: nb.LinearSDE(MATRIX, c * EYE), SOME.at(V[:2]), X3),
+    "set": (lambda c: nb.LinearSDE(MATRIX, c * EYE), AROUND, X3),
+    "landmarks": (lambda c: nb.KunitaFlow(FLOW, nb.GaussianKernel(c, 0.5)), nb.ExactMatch().at(datum(EYE, 2)), CURVE),
+    "waves": (
+        lambda c: nb.KunitaFlow(FLOW, nb.GaussianKernel(c, 0.5), noise=nb.SpectralNoise(2)),
+        nb.ExactMatch().at(datum(EYE, 2)),
+        CURVE,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_a_datum_that_no_path_reaches(name):
+    """Where a parameter takes the noise away, the weight is that of an impossible datum, and gradients stay finite."""
+    make, condition, x0 = DEGENERATE[name]
+
+    def weigh(c):
+        bridge = nb.GuidedBridge(make(c), condition, x0=x0, t1=1.0, num_steps=3)
+        path, log_weight = bridge.path_and_log_weight(jnp.ones(bridge.noise_shape))
+        return log_weight, path
+
+    (log_weight, path), slope = jax.jit(jax.value_and_grad(weigh, has_aux=True))(0.0)
+    assert log_weight == -np.inf and np.isfinite(slope) and np.isfinite(path).all()
+
+
+def test_a_datum_that_is_met_without_noise():
+    """It has no density: a weight that is visibly no number."""
+
+    @jax.jit
+    def weigh(c):
+        bridge = nb.GuidedBridge(nb.LinearSDE(0.0, c), nb.ExactMatch().at(V), x0=V, t1=1.0, num_steps=3)
+        return bridge.log_weight(jnp.ones(bridge.noise_shape))
+
+    assert np.isnan(weigh(0.0)) and np.isfinite(weigh(1.0))

@@ -347,6 +347,66 @@ def QUANTILES(z, a, b):
     return w, jnp.stack(gradient(z, a, b)), back
 
 
+NEAR_ENDS = np.array([-5.0, -0.7, 0.0, 1e-3, 0.4, 1.0, 3.0, 11.9, 12.1, 40.0, 1e3, 1e6])
+WIDTHS = np.array([1e-30, 1e-16, 1e-9, 1e-5, 1e-3, 0.1, 0.49, 0.51, 2.0, 11.0, np.inf])
+SCORES = np.array([-2.5, -0.3, 0.0, 1.1, 2.8])
+
+
+def near_end_and_width(s, d):
+    """log of ∫_0^d exp(−s v − v²/2) dv, and that of φ(s); the first by quadrature, or by a difference around 0."""
+    width = min(d, 45 / (1 + s)) if s >= 0 else d
+    if s < 0 and d > 0.1:
+        upper = scipy.special.ndtr(s + d) if np.isfinite(d) else 1.0
+        return np.log(upper - scipy.special.ndtr(s)) - scipy.stats.norm.logpdf(s), scipy.stats.norm.logpdf(s)
+    t, w = np.polynomial.legendre.leggauss(80)
+    v, w = width * (1 + t) / 2, width * w / 2
+    return np.log(np.sum(w * np.exp(-v * (s + 0.5 * v)))), scipy.stats.norm.logpdf(s)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_width_by_distance(dtype):
+    """Intervals of every width at every distance, in units of the SD, to either side, in both precisions.
+
+    One end is 0 and the mean moves, so that the width keeps its digits however far out: value,
+    derivatives by mean and far end, and the noise of a draw.
+    """
+    grid = np.meshgrid(NEAR_ENDS, WIDTHS, [1.0, -1.0], indexing="ij")
+    s, d, side = (a.ravel().astype(dtype) for a in grid)
+
+    @jax.jit
+    @jax.vmap
+    def found(s, d, sign):
+        def ends(d):
+            return jnp.where(sign < 0, -d, 0.0), jnp.where(sign < 0, 0.0, d)
+
+        def log_p(mean, d):
+            return log_interval_probability(*ends(d), mean)
+
+        value, slopes = jax.value_and_grad(log_p, argnums=(0, 1))(-sign * s, d)
+        z = sign * jnp.asarray(SCORES, s.dtype)
+        draw = jax.vmap(lambda z: truncated_quantile(z, *ends(d), -sign * s))(z)
+        back = jax.vmap(lambda x: truncated_quantile_inverse(x, *ends(d), -sign * s))(draw)
+        return value, sign * slopes[0], slopes[1], sign * draw, sign * back
+
+    answers = found(s, d, side)
+    s, d, value, by_mean, by_far_end, draw, back = (np.asarray(a, float) for a in (s, d, *answers))
+    log_integral, log_phi = np.transpose([near_end_and_width(*pair) for pair in zip(s, d, strict=True)])
+    rtol = {np.float64: 1e-9, np.float32: 3e-4}[dtype]
+    np.testing.assert_allclose(value, log_integral + log_phi, rtol=rtol / 100, atol=rtol)
+    finite = np.where(np.isinf(d), 1.0, d)
+    gap = np.where(np.isinf(d), np.inf, finite * (s + 0.5 * finite))
+    at_near, at_far = np.exp(-log_integral), np.exp(-gap - log_integral)
+    np.testing.assert_allclose(by_mean, -np.expm1(-gap) * at_near, rtol=10 * rtol, atol=rtol)
+    np.testing.assert_allclose(by_far_end, at_far, rtol=10 * rtol, atol=rtol * 1e-3)
+    assert np.all((draw >= 0) & (draw <= d[:, None]))
+    np.testing.assert_allclose(back, np.broadcast_to(SCORES, back.shape), rtol=0, atol=10 * rtol)
+    share = [
+        [np.exp(near_end_and_width(a, x)[0] - whole) for x in row]
+        for a, row, whole in zip(s, draw, log_integral, strict=True)
+    ]
+    np.testing.assert_allclose(share, np.broadcast_to(scipy.stats.norm.cdf(SCORES), back.shape), atol=10 * rtol)
+
+
 def test_columns_of_a_vector_condition():
     """A vector state is one column: the same density."""
     h = message(nb.InexactMatch(0.05), nb.LinearSDE(-0.5, 0.4), VALUE[:, 0], jnp.asarray(CURVE[:, 0]))

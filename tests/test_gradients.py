@@ -84,6 +84,10 @@ def user(p):
     )
 
 
+def clocked(p):
+    return nb.SDE(lambda t, x, a: a * t * x, lambda t, x, a: 0.6 + 0.1 * jnp.cos(t + x), p["drift"])
+
+
 def flow(p):
     return nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(p["amplitude"], p["length_scale"]))
 
@@ -103,6 +107,22 @@ def grid(p):
     return nb.KunitaFlow(nb.FourierBasis(1, 1), kernel, noise=nb.GridNoise(p["lower"], 5.0, 24))
 
 
+def sum_of_kernels(p):
+    rough = p["factor"] * nb.MaternKernel(p["amplitude"], 0.7, order=1)
+    return nb.KunitaFlow(nb.Landmarks(3, 2), covariance=rough + nb.GaussianKernel(0.2, p["length_scale"]))
+
+
+def quadrature(p):
+    kernel = nb.MaternKernel(p["amplitude"], p["length_scale"], order=2)
+    covariance = nb.kernels.QuadratureCovariance(kernel, [p["lower"]], [4.0], 20)
+    return nb.KunitaFlow(nb.Landmarks(3, 1), covariance=covariance)
+
+
+def on_the_grid(p):
+    kernel = nb.MaternKernel(p["amplitude"], 0.8, order=1)
+    return nb.KunitaFlow(nb.Landmarks(3, 1), kernel, noise=nb.GridNoise(p["lower"], 4.0, 20))
+
+
 def learned(p):
     one, none = jnp.ones(()), jnp.zeros(0)
     base = nb.DriftGuide(nb.FrozenGuide())
@@ -111,7 +131,7 @@ def learned(p):
 
 
 def inexact(p):
-    return nb.InexactMatch(p["variance"], p.get("operator"))
+    return nb.InexactMatch(p["variance"], p.get("operator")).at(p["observed"])
 
 
 PLAIN = {"x0": np.array([0.3, -0.2]), "observed": np.array([1.0, 0.5]), "t1": 1.2, "variance": 0.1}
@@ -136,11 +156,15 @@ def receding(p):
 
 
 def exact(p):
-    return nb.ExactMatch()
+    return nb.ExactMatch().at(p["observed"])
 
 
 def bins(p):
-    return nb.IntervalCensored(p["cuts"])
+    return nb.IntervalCensored(p["cuts"]).at(np.array([0.0, 1.0]))
+
+
+def pinned(p):
+    return nb.CylinderSet(jnp.stack([p["pin"], p["lower"]]), jnp.stack([p["pin"], p["upper"]]))
 
 
 def brownian(p):
@@ -153,29 +177,42 @@ CUTS = {"cuts": np.array([0.1, 0.9])}
 WIDE = {"length_scale": 0.9, "period": 9.5}
 CURVE = {"x0": 0.4 * TRIANGLE[:, :1], "observed": 0.4 * TRIANGLE[:, 1:]}
 BOX = {"length_scale": 0.5, "lower": -4.0}
+MIXED = {"factor": 0.5, "length_scale": 0.9, "end_weight": 0.2}
+CELLS = {"x0": np.array([[0.2], [1.0], [-0.6]]), "lower": -4.0}  # two of them are midpoints of cells
+MEETING = {"x0": np.array([[0.2], [0.2], [-0.6]]), "lower": -4.0}
+CLOCK = {"x0": PLAIN["x0"], "observed": PLAIN["observed"], "variance": 0.1, "drift": -0.5}
+PIN = {"x0": PLAIN["x0"], "t1": 1.2, "pin": 0.4, "lower": -0.2, "upper": 0.5}
 RANK_ONE = {"drift": B, "diffusion": B[:, 1:], "operator": np.array([[1.0, 0.5], [0.0, 1.0]])}
 
 CASES = {
     "no rate": (linear, inexact, no_guide, PLAIN | RATE | {"shift": np.array([1.0, 0.2])}),
     "no rate, no noise": (linear, inexact, no_guide, PLAIN | DIAGONAL),
     "opposite rates": (linear, inexact, no_guide, PLAIN | OPPOSITE),
+    "no matrix of rates": (linear, inexact, no_guide, PLAIN | {"drift": np.zeros((2, 2)), "diffusion": MATRIX}),
     "rank one": (linear, inexact, no_guide, PLAIN | RANK_ONE),
     "learned": (user, inexact, learned, PLAIN | DIAGONAL | {"network": 0.3}),
     "covariance": (brownian, inexact, no_guide, PLAIN | {"Q": MATRIX, "variance": 0.1 * MATRIX}),
     "exact": (linear, exact, unguided, FEW | RATE),
+    "pinned": (linear, pinned, no_guide, PIN | RATE),
+    "times": (clocked, inexact, no_guide, CLOCK | {"ts": np.array([0.4, 1.0, 1.3])}),
+    "interval": (clocked, inexact, no_guide, CLOCK | {"t0": 0.4, "t1": 1.3}),
     "bins": (linear, bins, no_guide, FEW | RATE | CUTS),
     "flow": (flow, inexact, receding, SHAPES | {"length_scale": 0.9, "end_weight": 0.0}),
     "no jitter": (jittered, inexact, receding, SHAPES | JITTER | {"end_weight": 1.0}),
+    "sum of kernels": (sum_of_kernels, inexact, receding, SHAPES | MIXED),
+    "quadrature": (quadrature, inexact, no_guide, SHAPES | CURVE | CELLS | {"length_scale": 0.8}),
+    "on the grid, coincident": (on_the_grid, inexact, no_guide, SHAPES | CURVE | MEETING),
     "underflow": (spectral, inexact, no_guide, SHAPES | PAIR | WIDE),
     "basis": (grid, inexact, no_guide, SHAPES | CURVE | BOX),
 }
-"""What is built: an SDE, a match, a guide; and the parameters."""
+"""What is built: an SDE, a condition, a guide; and the parameters."""
 
 
 def bridge_of(name, p):
-    sde, match, guide, _ = CASES[name]
-    condition = match(p).at(np.array([0.0, 1.0]) if match is bins else p["observed"])
-    return nb.GuidedBridge(sde(p), condition, x0=p["x0"], t1=p["t1"], num_steps=2, guide=guide(p))
+    sde, condition, guide, _ = CASES[name]
+    times = {name: p[name] for name in ("t0", "t1", "ts") if name in p}
+    num_steps = None if "ts" in p else 2
+    return nb.GuidedBridge(sde(p), condition(p), x0=p["x0"], num_steps=num_steps, guide=guide(p), **times)
 
 
 def test_every_public_class_has_a_case():

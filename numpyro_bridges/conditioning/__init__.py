@@ -6,5 +6,10 @@ from ._base import (
 )
 from ._cylinder import CylinderSet as CylinderSet, IntervalCensored as IntervalCensored
 from ._match import ExactMatch as ExactMatch, InexactMatch as InexactMatch
-from ._message import GaussianMessage as GaussianMessage, whitened_log_density as whitened_log_density
+from ._message import (
+    GaussianMessage as GaussianMessage,
+    gaussian_log_density as gaussian_log_density,
+    where_possible as where_possible,
+    whitened_log_density as whitened_log_density,
+)
 from ._normal import log_interval_probability as log_interval_probability

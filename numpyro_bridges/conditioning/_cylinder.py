@@ -113,11 +113,15 @@ class CylinderSet(AbstractCondition):
 
         def one(interval: tuple[Array, ...], center: Array, z: Array, scale: Array):
             low, high, lost, pinned = interval
+            empty = scale == 0
+            scale = jnp.where(empty, 1.0, scale)
             drawn = truncated_quantile(z, *_free_where(pinned, low, high), center, scale, lost)
-            value = jnp.where(pinned, low, drawn)
+            value = jnp.where(pinned, low, jnp.where(empty, jnp.clip(center, low, high), drawn))
             w = (value - center) / scale
             inside = log_interval_probability(*_free_where(pinned, low, high), center, scale, lost)
             chosen = inside + 0.5 * w * w + _LOG_SQRT_2PI + jnp.log(scale)
+            # a value without variance is outside the set, or inside, where its choice has no density
+            chosen = jnp.where(empty, jnp.where(value == center, jnp.nan, -jnp.inf), chosen)
             return value, jnp.where(pinned, 0.0, chosen), w
 
         if factor.ndim < 2:
@@ -144,7 +148,8 @@ class CylinderSet(AbstractCondition):
 
     def target(self, law_mean, law_factor, noise):
         value, log_weights = self._scan(law_mean, law_factor, noise[0, : law_mean.shape[0]])
-        return Target(value, jnp.sum(log_weights))
+        impossible = jnp.any(log_weights == -jnp.inf)  # whatever the others weigh
+        return Target(value, jnp.where(impossible, -jnp.inf, jnp.sum(log_weights)))
 
     def noise_from_target(self, law_mean, law_factor, seen):
         lower, upper, lost, pinned = self._bounds(seen)

@@ -22,12 +22,12 @@ from .._checks import (
     require_positive,
     words,
 )
-from .._linalg import apply, cholesky, columns, congruence, diagonal, solve_lower, symmetric
+from .._linalg import apply, cholesky, columns, congruence, diagonal, symmetric
 from .._types import State, Structured
 from ..sdes import AbstractSDE
 from ..spaces import AbstractSpace
 from ._base import AbstractCondition, AbstractMatch, Observation, Target, lift
-from ._message import whitened_log_density
+from ._message import gaussian_log_density
 
 _LOG_2PI = 1.8378770664093453
 
@@ -69,7 +69,7 @@ class _Seen(AbstractCondition):
         return _Seen(match=self.match, observed=self.observed - shift)
 
     def log_value(self, law_mean, law_factor):
-        return whitened_log_density(solve_lower(law_factor, self.observed - law_mean), law_factor)
+        return gaussian_log_density(self.observed - law_mean, law_factor)
 
     def target(self, law_mean, law_factor, noise):
         return Target(self.observed, jnp.zeros((), self.observed.dtype))
@@ -82,6 +82,10 @@ class ExactMatch(AbstractMatch):
     """The end state is seen without noise, v = L X_T: the first coordinates, some points, or all.
 
     There is no limit as the number of coordinates grows; it is part of the model.
+
+    It needs noise in every direction that is seen, and an SDE that is known to have none is refused. Where a traced
+    parameter takes the noise away (a scale that underflows), the log weight is −inf, the datum being out of reach, or
+    NaN where it is met to the last digit: there is no density then.
 
     **Arguments:**
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import apply, columns, log_diagonal, promote, solve_lower, transpose
+from .._linalg import apply, columns, filled, log_diagonal, promote, rows, solve_lower, transpose, without_variance
 from .._types import State, Structured
 
 _LOG_2PI = 1.8378770664093453
@@ -32,7 +32,7 @@ class GaussianMessage(eqx.Module):
 
     def log_value(self, x: State) -> Float[Array, ""]:
         """log h(x)."""
-        return self.log_scale + whitened_log_density(self.residual(x), self.factor)
+        return self.log_scale + gaussian_log_density(self.observed - self.shift - apply(self.operator, x), self.factor)
 
     def score(self, x: State) -> State:
         """∇ log h(x) = Lᵀ (P Pᵀ)⁻¹ (v − L x − shift)."""
@@ -44,6 +44,23 @@ class GaussianMessage(eqx.Module):
         root = solve_lower(promote(self.factor, 2, m), promote(self.operator, 2, n))
         v = solve_lower(self.factor, self.observed - self.shift)
         return root.T @ root, root.T @ v, self.log_scale + whitened_log_density(v, self.factor)
+
+
+def gaussian_log_density(r: State, factor: Structured) -> Float[Array, ""]:
+    """log N(r; 0, P Pᵀ); −inf where a coordinate of r has no variance and is not 0."""
+    empty = without_variance(factor)
+    factor = filled(factor, empty)
+    return where_possible(r, empty, whitened_log_density(solve_lower(factor, r), factor))
+
+
+def where_possible(r: State, empty: Array, log_value: Float[Array, ""]) -> Float[Array, ""]:
+    """A log density of r, whose coordinates have no variance where `empty`, by `without_variance`.
+
+    If one of those is not 0 there is no such r, and the density is 0. If it is 0 there is no density: NaN.
+    """
+    there = empty if empty.ndim == 0 else rows(empty, r)
+    impossible = jnp.any(there & (r != 0))
+    return jnp.where(impossible, -jnp.inf, jnp.where(jnp.any(empty), jnp.nan, log_value))
 
 
 def whitened_log_density(y: State, factor: Structured) -> Float[Array, ""]:

@@ -19,7 +19,7 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._linalg import (
     add,
@@ -29,12 +29,14 @@ from .._linalg import (
     columns,
     compose,
     congruence,
+    filled,
     log_diagonal,
     solve_lower,
     transpose,
+    without_variance,
 )
 from .._types import Noise, State, Structured
-from ..conditioning import whitened_log_density
+from ..conditioning import where_possible, whitened_log_density
 from ..sdes import Transition
 from ._drive import drive
 
@@ -61,12 +63,17 @@ def log_ratio(z: Noise, u: Noise) -> Float[Array, ""]:
 
 
 class GaussianSteering(AbstractSteering):
-    """The conditional law of the noise given v ~ N(operator x' + shift, covariance); covariance None is exact."""
+    """The conditional law of the noise given v ~ N(operator x' + shift, covariance); covariance None is exact.
+
+    What of v has no variance at all tells nothing of the noise: it is filled with a variance of 1, and `log_evidence`
+    alone asks whether it is as it must be.
+    """
 
     A: Structured
     S: Structured
     M: Structured | None
     r: State
+    empty: Bool[Array, "..."]
 
     def __init__(
         self,
@@ -78,8 +85,10 @@ class GaussianSteering(AbstractSteering):
     ):
         S = congruence(operator, transition.covariance)
         self.A = compose(operator, transition.factor)
-        self.S = S if covariance is None else add(covariance, S)
-        self.M = covariance
+        S = S if covariance is None else add(covariance, S)
+        self.empty = without_variance(S)
+        self.S = filled(S, self.empty)
+        self.M = None if covariance is None else filled(covariance, self.empty)
         self.r = observed - shift - apply(operator, transition.mean)
 
     def _factors(self) -> tuple[Structured, Structured, State]:
@@ -121,7 +130,7 @@ class GaussianSteering(AbstractSteering):
     def log_evidence(self) -> Float[Array, ""]:
         """log density of the observation given the present state: what the last step weighs."""
         N, _, y = self._factors()
-        return whitened_log_density(y, N)
+        return where_possible(self.r, self.empty, whitened_log_density(y, N))
 
 
 class DriftSteering(AbstractSteering):

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._linalg import apply, cholesky, promote, solve_lower, transpose
+from .._linalg import apply, cholesky, promote, transpose
 from .._types import State
 from ..bridges import GuidedBridge
-from ..conditioning import ExactMatch, GaussianMessage, whitened_log_density
+from ..conditioning import ExactMatch, GaussianMessage, gaussian_log_density
 from ..guiding import AbstractGuide, Unguided, default_guide
 from ..sdes import Transition
 from ._reversed import ReversedSDE
@@ -123,7 +123,7 @@ def reversed_bridge(bridge: GuidedBridge, end: State, guide: AbstractGuide | Non
 def log_density(transition: Transition, y: State) -> Float[Array, ""]:
     """log N(y; mean, covariance)."""
     factor = cholesky(promote(transition.covariance, 1, y.shape[0]))
-    return whitened_log_density(solve_lower(factor, y - transition.mean), factor)
+    return gaussian_log_density(y - transition.mean, factor)
 
 
 def _drawn(law: Callable) -> Callable:
