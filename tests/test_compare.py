@@ -15,6 +15,8 @@ import numpyro_bridges as nb
 from numpyro_bridges._compare import _score_error
 from numpyro_bridges.guiding._steering import DriftSteering
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+
 RATE, SIGMA, SHIFT, VARIANCE, T = 0.8, 0.6, 0.3, 0.05, 1.0
 X0, V = np.array([0.1, 0.5]), np.array([0.7, -0.2])
 

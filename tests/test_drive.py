@@ -9,6 +9,8 @@ from jax.test_util import check_grads
 
 from numpyro_bridges.guiding._drive import drive
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+
 
 def test_derivative_of_the_drive(key):
     """In all five arguments, the covariances through factors so that they stay symmetric."""

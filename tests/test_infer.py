@@ -28,6 +28,8 @@ from numpyro_bridges.infer import (
 )
 from numpyro_bridges.infer._pseudo_marginal import _choose
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+
 DATA = np.random.default_rng(0).normal(0.5, 0.5, (3, 2))
 
 

@@ -6,12 +6,15 @@ import jax.random as jr
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+import pytest
+import scipy.linalg
+import scipy.optimize
 from numpyro.infer.util import potential_energy
 from scipy.linalg import expm
 
 import numpyro_bridges as nb
 from numpyro_bridges.infer._posterior import driven_by, energies_of, misfit
-from numpyro_bridges.infer._reference import Reference, start_windows, update_windows
+from numpyro_bridges.infer._reference import Reference, laplace, start_windows, update_windows
 from numpyro_bridges.infer._rotation import kick, metropolis, rotate
 
 RNG = np.random.default_rng(0)
@@ -50,6 +53,35 @@ def test_reference():
     gradient = jax.grad(lambda y: slope @ reference.colour(y))(y)
     np.testing.assert_allclose(reference.whiten_gradient(slope), gradient, rtol=1e-12)
     np.testing.assert_allclose(reference.colour_gradient(gradient), slope, rtol=1e-12)
+
+
+def badly_scaled(x):
+    return 0.5 * x @ jnp.array([[400.0, 6.0, 0.0], [6.0, 0.5, 0.05], [0.0, 0.05, 0.02]]) @ x - x[0] + x[2]
+
+
+def bent(x):
+    """A valley, and a wall of NaN, beyond which the first step leads."""
+    valley = 10 * (x[1] - x[0] ** 2) ** 2 + (1 - x[0]) ** 2
+    return jnp.where(x[0] > 1.5, jnp.nan, valley + 0.5 * x[2] ** 2)
+
+
+POTENTIALS = [(badly_scaled, [3.0, -1.0, 2.0]), (bent, [-1.2, 1.0, 0.3]), (bent, [1.4, -3.0, 0.0])]
+
+
+@pytest.mark.parametrize("potential, start", POTENTIALS)
+def test_laplace(potential, start):
+    """The mode as SciPy finds it, and the inverse Hessian there, which BFGS knows to a factor: it is a first mass matrix."""
+    found = jax.jit(lambda x: laplace(potential, x))(jnp.asarray(start))
+    mode = scipy.optimize.minimize(potential, np.ones(3), jac=jax.grad(potential), method="BFGS", tol=1e-9).x
+    covariance = found.scale @ found.scale.T
+    np.testing.assert_allclose(found.mean, mode, atol=1e-3 * np.sqrt(np.diag(covariance)).max())
+    ratios = scipy.linalg.eigvalsh(covariance, np.linalg.inv(jax.hessian(potential)(mode)))
+    assert np.all((ratios > 1 / 1.5) & (ratios < 1.5)), ratios
+
+
+def test_laplace_without_a_start():
+    found = jax.jit(lambda x: laplace(bent, x))(jnp.array([2.0, 0.0, 1.0]))
+    assert np.array_equal(found.mean, [2.0, 0.0, 1.0]) and np.array_equal(found.scale, np.eye(3))
 
 
 def test_windows():

@@ -9,6 +9,8 @@ import pytest
 import numpyro_bridges as nb
 from numpyro_bridges import datasets, plot
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+
 matplotlib = pytest.importorskip("matplotlib", reason="matplotlib is not installed")
 matplotlib.use("Agg")
 plt = pytest.importorskip("matplotlib.pyplot")

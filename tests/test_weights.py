@@ -11,6 +11,8 @@ import pytest
 
 from numpyro_bridges import weights
 
+pytestmark = pytest.mark.usefixtures("compile_quickly")
+
 SHIFTS = [0.0, 1e4, -1e4]
 STATISTICS = [weights.effective_sample_size, weights.standard_error, weights.pareto_k]
 

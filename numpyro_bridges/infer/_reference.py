@@ -6,10 +6,10 @@ windows of the warm-up. y has the role of the noise: N(0, I) but for what the ke
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.optimize import minimize
 from numpyro.infer.hmc_util import welford_covariance
 
 from ._rotation import choose
@@ -43,8 +43,61 @@ def laplace(potential, theta: Array) -> Reference:
     start = Reference(theta, jnp.eye(theta.size, dtype=theta.dtype))
     if not theta.size:
         return start
-    found = minimize(potential, theta, method="BFGS", options={"maxiter": 50})
-    return _if_finite(Reference(found.x, jnp.linalg.cholesky(found.hess_inv)), start)
+    mode, inverse_hessian = _bfgs(jax.value_and_grad(potential), theta)
+    return _if_finite(Reference(mode, jnp.linalg.cholesky(inverse_hessian)), start)
+
+
+_MAX_EVALUATIONS = 100
+_GRADIENT_TOLERANCE = 1e-5
+
+
+class _Search(NamedTuple):
+    """The best point x so far, its value, slope and the inverse Hessian there; x + step is tried next."""
+
+    x: Array
+    value: Array
+    slope: Array
+    inverse: Array
+    step: Array
+    num_evaluations: Array
+
+
+def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
+    """A minimum and the inverse Hessian by BFGS with backtracking (Nocedal and Wright, 2006, algorithm 6.1).
+
+    One loop evaluates the function at one place. `jax.scipy.optimize.minimize` holds six copies of it, and compiling
+    them is most of what the start of a chain takes.
+    """
+
+    def go_on(search: _Search):
+        moves = jnp.max(jnp.abs(search.slope)) > _GRADIENT_TOLERANCE
+        return (moves | (search.num_evaluations == 0)) & (search.num_evaluations < _MAX_EVALUATIONS)
+
+    def body(search: _Search):
+        x, value, slope, inverse, step, count = search
+        new_value, new_slope = value_and_grad(x + step)
+        enough = new_value <= value + 1e-4 * slope @ step
+        good = enough & jnp.all(jnp.isfinite(new_slope))
+        updated = _inverse_update(inverse, step, new_slope - slope)
+        inverse = choose(good & (count > 0), updated, inverse)
+        x, value, slope = choose(good, (x + step, new_value, new_slope), (x, value, slope))
+        full = -inverse @ slope
+        length = jnp.where(count == 0, jnp.minimum(1.0, 1 / jnp.linalg.norm(full)), 1.0)
+        return _Search(x, value, slope, inverse, jnp.where(good, length * full, 0.5 * step), count + 1)
+
+    infinite, none = jnp.asarray(jnp.inf, x.dtype), jnp.zeros_like(x)
+    start = _Search(x, infinite, none, jnp.eye(x.size, dtype=x.dtype), none, jnp.zeros((), int))
+    found = jax.lax.while_loop(go_on, body, start)
+    return jnp.where(jnp.isfinite(found.value), found.x, jnp.nan), found.inverse
+
+
+def _inverse_update(inverse: Array, step: Array, change: Array) -> Array:
+    """The BFGS update of the inverse Hessian; none without positive curvature."""
+    curvature = step @ change
+    curved = curvature > 1e-12 * jnp.linalg.norm(step) * jnp.linalg.norm(change)
+    rho = 1 / jnp.where(curved, curvature, 1.0)
+    left = jnp.eye(step.size, dtype=step.dtype) - rho * jnp.outer(step, change)
+    return jnp.where(curved, left @ inverse @ left.T + rho * jnp.outer(step, step), inverse)
 
 
 class Windows(NamedTuple):
