@@ -1,11 +1,16 @@
 """Strict settings for everything below the NumPyro layers, and the fixtures that the tests share."""
 
+import importlib.metadata
 import os
 import secrets
 from pathlib import Path
 
 # Before JAX is imported: threads cost more than they give on the small matrices of the tests.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Half of the compile time of small programs, while JAX has this choice; XLA stops at a flag that it does not know.
+if importlib.metadata.version("jaxlib").startswith("0.9."):
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import jax
 import jax.random as jr

@@ -315,6 +315,9 @@ STACKS = {
     "a law": lambda make: jax.vmap(make)(RATES),
     "of a batch": lambda make: jax.vmap(lambda rate: make(rate, x0=STARTS[:2], batch_shape=(2,)))(RATES),
     "expanded": lambda make: jax.vmap(lambda rate: make(rate).expand((2,)))(RATES),
+    "of a batch, expanded": lambda make: jax.vmap(
+        lambda rate: make(rate, x0=STARTS[:2], batch_shape=(2,)).expand((3, 2))
+    )(RATES),
     "masked": lambda make: jax.vmap(lambda rate: make(rate).mask(rate < 2.0))(RATES),
     "in scan": lambda make: jax.lax.scan(lambda _, rate: (None, make(rate)), None, RATES)[1],
 }
@@ -328,11 +331,11 @@ def test_a_stack_of_laws_is_a_batch(name):
         return endpoint(MATCHES["inexact"], nb.LinearSDE(-rate, SIGMA), guide=None, **kwargs)
 
     law = STACKS[name](make)
-    batch = (4, 2) if name in ("of a batch", "expanded") else (4,)
+    batch = {"of a batch": (4, 2), "expanded": (4, 2), "of a batch, expanded": (4, 3, 2)}.get(name, (4,))
     z, v = noise_for(law), datum_for(law)
     assert law.batch_shape == batch and v.shape == (*batch, 3, 2) and law.noise_prior().batch_shape == batch
     variances = SIGMA**2 * (1 - np.exp(-2 * RATES)) / (2 * RATES) + 0.05
-    starts = np.stack([STARTS[:2]] * 4) if name == "of a batch" else np.broadcast_to(X0, (*batch, 3, 2))
+    starts = np.broadcast_to(STARTS[:2] if "of a batch" in name else X0, (*batch, 3, 2))
     shape = (4,) + (1,) * (len(batch) + 1)
     normal = dist.Normal(np.exp(-RATES).reshape(shape) * starts, np.sqrt(variances).reshape(shape))
     np.testing.assert_allclose(law.given(z).log_prob(v), normal.log_prob(v).sum((-1, -2)), atol=1e-6)

@@ -337,7 +337,7 @@ def four_chains():
 def test_chains_on_two_devices():
     """Half of them on each, and the draws are those of one device."""
     settings = {
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2",
         "JAX_ENABLE_X64": "1",
         "PYTHONPATH": str(Path(nb.__file__).parents[1]),
     }
