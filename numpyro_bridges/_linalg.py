@@ -119,11 +119,16 @@ def safe_sqrt(x: Array) -> Array:
 
 
 def cholesky(S: Structured) -> Structured:
-    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite, but for coordinates without variance."""
+    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite, but for zeros of a diagonal one."""
+    return safe_sqrt(S) if S.ndim < 2 else lax.linalg.cholesky(S, symmetrize_input=False)
+
+
+def semidefinite_cholesky(S: Structured) -> Structured:
+    """The same, with rows of zeros for coordinates without variance."""
     if S.ndim < 2:
         return safe_sqrt(S)
     empty = without_variance(S)
-    return jnp.where(empty[:, None], 0.0, lax.linalg.cholesky(filled(S, empty), symmetrize_input=False))
+    return jnp.where(empty[:, None], 0.0, cholesky(filled(S, empty)))
 
 
 def without_variance(S: Structured) -> Array:

@@ -70,7 +70,7 @@ POTENTIALS = [(badly_scaled, [3.0, -1.0, 2.0]), (bent, [-1.2, 1.0, 0.3]), (bent,
 
 @pytest.mark.parametrize("potential, start", POTENTIALS)
 def test_laplace(potential, start):
-    """The mode as SciPy finds it, and the inverse Hessian there, which BFGS knows to a factor: it is a first mass matrix."""
+    """The mode as SciPy finds it, and the inverse Hessian there, to a factor: a first mass matrix."""
     found = jax.jit(lambda x: laplace(potential, x))(jnp.asarray(start))
     mode = scipy.optimize.minimize(potential, np.ones(3), jac=jax.grad(potential), method="BFGS", tol=1e-9).x
     covariance = found.scale @ found.scale.T

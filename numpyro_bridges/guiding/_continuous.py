@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import add, apply, cholesky, columns, congruence, promote, solve_lower, varying_like
+from .._linalg import add, apply, columns, congruence, promote, semidefinite_cholesky, solve_lower, varying_like
 from .._types import RealScalar, State
 from ..conditioning import GaussianMessage, Observation
 from ..sdes import AbstractSDE, LinearSDE
@@ -46,7 +46,7 @@ def exact_message(auxiliary: LinearSDE, seen: Observation, t, t1, x: State, obse
     M = add(congruence(operator, step.covariance), seen.covariance)
     flow = step.operator if operator.ndim == 0 else promote(operator, 2, n) @ promote(step.operator, 2, n)
     shift = apply(operator, step.shift)
-    return GaussianMessage(flow, shift, cholesky(M), observed, seen.log_scale)
+    return GaussianMessage(flow, shift, semidefinite_cholesky(M), observed, seen.log_scale)
 
 
 def weight_rate(sde: AbstractSDE, auxiliary: LinearSDE, message: GaussianMessage, t, x: State):

@@ -94,7 +94,8 @@ def _ends(plan: AbstractPlan):
 def _last_step(sde, seen, ts, x, observed) -> tuple[Transition, GaussianSteering]:
     transition = sde.transition(ts[-2], ts[-1], x)
     covariance = None if seen.exact else seen.covariance
-    return transition, GaussianSteering(transition, seen.operator, jnp.zeros_like(observed), covariance, observed)
+    shift = jnp.zeros_like(observed)
+    return transition, GaussianSteering(transition, seen.operator, shift, covariance, observed, seen.exact)
 
 
 def _driving_noise(transition: Transition, x: State, free: Noise) -> Noise:

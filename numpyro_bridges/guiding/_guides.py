@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from .._checks import as_float, require, require_instance
-from .._linalg import add, apply, cholesky, compose, congruence, promote, varying_like
+from .._linalg import add, apply, compose, congruence, promote, semidefinite_cholesky, varying_like
 from .._types import RealScalar, State, Structured
 from ..conditioning import GaussianMessage, Observation
 from ..sdes import AbstractSDE, AffineStep, BrownianMotion, Displaced, LinearSDE, Transition
@@ -86,14 +86,15 @@ class AbstractGuide(eqx.Module):
 
 class _FrozenPlan(AbstractPlan):
     steps: tuple[Structured, State, Structured]
+    exact: bool = eqx.field(static=True)
 
     def steer(self, step, transition, dt, x, observed):
         operator, shift, covariance = step
-        return GaussianSteering(transition, operator, shift, covariance, observed)
+        return GaussianSteering(transition, operator, shift, covariance, observed, self.exact)
 
     def message(self, step, sde, t, x, observed):
         operator, shift, covariance = step
-        return GaussianMessage(operator, shift, cholesky(covariance), observed, jnp.zeros((), x.dtype))
+        return GaussianMessage(operator, shift, semidefinite_cholesky(covariance), observed, jnp.zeros((), x.dtype))
 
 
 class FrozenGuide(AbstractGuide):
@@ -128,7 +129,7 @@ class FrozenGuide(AbstractGuide):
         return self.auxiliary is None
 
     def plan(self, sde, seen, reference, ts):
-        return _FrozenPlan(backward_filter(self._steps(sde, reference, ts), seen))
+        return _FrozenPlan(backward_filter(self._steps(sde, reference, ts), seen), seen.exact)
 
     def _steps(self, sde, reference, ts) -> AffineStep:
         if self.auxiliary is None:
@@ -147,6 +148,7 @@ class _RecedingPlan(AbstractPlan):
     noise: Structured
     end_covariance: Structured
     end_weight: Structured
+    exact: bool = eqx.field(static=True)
 
     def _forecast(self, step, a: Structured):
         flow, shift, kappa = step
@@ -155,11 +157,11 @@ class _RecedingPlan(AbstractPlan):
         return compose(self.operator, flow), shift, covariance
 
     def steer(self, step, transition, dt, x, observed):
-        return GaussianSteering(transition, *self._forecast(step, transition.covariance / dt), observed)
+        return GaussianSteering(transition, *self._forecast(step, transition.covariance / dt), observed, self.exact)
 
     def message(self, step, sde, t, x, observed):
         operator, shift, covariance = self._forecast(step, sde.covariance(t, x))
-        return GaussianMessage(operator, shift, cholesky(covariance), observed, jnp.zeros((), x.dtype))
+        return GaussianMessage(operator, shift, semidefinite_cholesky(covariance), observed, jnp.zeros((), x.dtype))
 
 
 class RecedingGuide(AbstractGuide):
@@ -209,7 +211,7 @@ class RecedingGuide(AbstractGuide):
         start = varying_like(start, seen, operator, shift, ts)
         _, planned = jax.lax.scan(back, start, (operator, shift, jnp.diff(ts)), reverse=True)
         return _RecedingPlan(
-            planned, seen.operator, seen.covariance, sde.covariance(ts[-1], reference), self.end_weight
+            planned, seen.operator, seen.covariance, sde.covariance(ts[-1], reference), self.end_weight, seen.exact
         )
 
 

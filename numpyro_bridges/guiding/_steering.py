@@ -65,8 +65,9 @@ def log_ratio(z: Noise, u: Noise) -> Float[Array, ""]:
 class GaussianSteering(AbstractSteering):
     """The conditional law of the noise given v ~ N(operator x' + shift, covariance); covariance None is exact.
 
-    What of v has no variance at all tells nothing of the noise: it is filled with a variance of 1, and `log_evidence`
-    alone asks whether it is as it must be.
+    Where v is a forecast of something seen without noise, `may_be_empty`, a part of it may have no variance at all, and
+    then tells nothing of the noise of the step: it is filled with a variance of 1, and `log_evidence` alone asks
+    whether it is as it must be.
     """
 
     A: Structured
@@ -82,13 +83,14 @@ class GaussianSteering(AbstractSteering):
         shift: State,
         covariance: Structured | None,
         observed: State,
+        may_be_empty: bool = False,
     ):
         S = congruence(operator, transition.covariance)
         self.A = compose(operator, transition.factor)
         S = S if covariance is None else add(covariance, S)
-        self.empty = without_variance(S)
-        self.S = filled(S, self.empty)
-        self.M = None if covariance is None else filled(covariance, self.empty)
+        self.empty = without_variance(S) if may_be_empty else jnp.zeros((), bool)
+        self.S = filled(S, self.empty) if may_be_empty else S
+        self.M = filled(covariance, self.empty) if may_be_empty and covariance is not None else covariance
         self.r = observed - shift - apply(operator, transition.mean)
 
     def _factors(self) -> tuple[Structured, Structured, State]:

@@ -13,7 +13,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import as_float, concrete, require, require_finite
-from .._linalg import add, apply, cholesky, compose, congruence, promote, symmetric, transpose, varying_like
+from .._linalg import (
+    add,
+    apply,
+    compose,
+    congruence,
+    promote,
+    semidefinite_cholesky,
+    symmetric,
+    transpose,
+    varying_like,
+)
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
 from ._base import AbstractSDE, AffineStep, Frame, Transition, as_state_shift, require_space
@@ -72,10 +82,10 @@ def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array
 def _psd_cholesky(S: Structured) -> Structured:
     """Cholesky factor of a covariance that may be singular: a nugget of a few rounding errors per diagonal entry."""
     if S.ndim < 2:
-        return cholesky(S)
+        return semidefinite_cholesky(S)
     d = jnp.diagonal(S)
     eps = jnp.finfo(S.dtype).eps
-    return cholesky(S + jnp.diag(4 * eps * d + 1e-24 * jnp.max(d)))
+    return semidefinite_cholesky(S + jnp.diag(4 * eps * d + 1e-24 * jnp.max(d)))
 
 
 class BrownianMotion(AbstractSDE):
@@ -100,7 +110,7 @@ class BrownianMotion(AbstractSDE):
 
     def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
         Q = symmetric(self.covariance_operator)
-        return cholesky(Q), Q
+        return semidefinite_cholesky(Q), Q
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         return jnp.zeros((), x.dtype), jnp.zeros_like(x)
@@ -261,7 +271,7 @@ def _covariance(value, name: str) -> Array:
         Q.ndim < 2 or (Q.ndim == 2 and Q.shape[0] == Q.shape[1]), f"`{name}` must be (), (n,) or (n, n); got {Q.shape}."
     )
     if concrete(Q) is not None:
-        factor = cholesky(Q)
+        factor = semidefinite_cholesky(Q)
         require(
             Q.ndim < 2 or jnp.allclose(Q, Q.T),
             f"`{name}` must be symmetric; it differs from its transpose by {concrete(jnp.max(jnp.abs(Q - Q.T)))}. "

@@ -80,8 +80,11 @@ class LandmarkNoise(AbstractNoise):
         jitter = self.jitter
         if jitter is None:
             jitter = jnp.asarray(1e-5 if K.dtype == jnp.float32 else 1e-10, K.dtype)
-        K = add(K, jitter.astype(K.dtype) * covariance.variance.astype(K.dtype))
-        return cholesky(K), K
+        variance = covariance.variance.astype(K.dtype)
+        K = add(K, jitter.astype(K.dtype) * variance)
+        none = variance == 0  # an amplitude that underflows
+        factor = cholesky(jnp.where(none, jnp.eye(len(K), dtype=K.dtype), K))
+        return jnp.where(none, 0.0, factor), K
 
 
 class SpectralNoise(AbstractNoise):
