@@ -83,7 +83,8 @@ def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
         x, value, slope = choose(good, (x + step, new_value, new_slope), (x, value, slope))
         full = -inverse @ slope
         length = jnp.where(count == 0, jnp.minimum(1.0, 1 / jnp.linalg.norm(full)), 1.0)
-        return _Search(x, value, slope, inverse, jnp.where(good, length * full, 0.5 * step), count + 1)
+        step = choose(good, length * full, 0.5 * step)
+        return _Search(x, value, slope, inverse, step, count + 1)
 
     infinite, none = jnp.asarray(jnp.inf, x.dtype), jnp.zeros_like(x)
     start = _Search(x, infinite, none, jnp.eye(x.size, dtype=x.dtype), none, jnp.zeros((), int))

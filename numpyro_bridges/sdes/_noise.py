@@ -166,7 +166,8 @@ class SpectralNoise(AbstractNoise):
         gap = jnp.maximum(period - extent.astype(period.dtype), 0)
         ends = gap * np.eye(2, dim, k=-1, dtype=gap.dtype)
         values = covariance.matrix(ends[:1], ends)[0]
-        return jnp.where(values[0] == 0, 0.0, values[1] / jnp.where(values[0] == 0, 1.0, values[0]))
+        none = values[0] == 0  # an amplitude that underflows
+        return lax.select(none, jnp.zeros_like(values[1]), values[1] / jnp.where(none, 1.0, values[0]))
 
     def error(self, kernel, covariance, dim, points):
         """The truncated `tail` (variance missing at a point), and the `wrap_around`, at the given diameter or for the
