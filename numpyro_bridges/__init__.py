@@ -44,3 +44,4 @@ from .sdes import (
     simulate as simulate,
 )
 from .spaces import AbstractSpace as AbstractSpace, FourierBasis as FourierBasis, Landmarks as Landmarks
+from .trees import Tree as Tree

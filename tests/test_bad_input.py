@@ -96,6 +96,7 @@ COMPARISON = nb.Comparison(
 )
 ESTIMATE = nb.EvidenceEstimate(ONE, ONE, ONE, 0.1, 0.1, jnp.zeros(4))
 SPECIMEN = io.Specimen(SQUARE, id="a")
+TREE = nb.Tree.from_newick("((a:1,b:2):1,c:3);")
 
 
 def model(observed=None):
@@ -130,6 +131,7 @@ OBJECTS = {
     "standard": STANDARD,
     "comparison": COMPARISON,
     "specimen": SPECIMEN,
+    "tree": TREE,
     "optimizer": optax.sgd(0.1),
 }
 """One object of each kind; what is asked for is replaced by any of the others, or by its class."""
@@ -298,6 +300,40 @@ def table() -> dict[str, Row]:
         "GuidedBridge.scores": row(BRIDGE.scores, path=("array", PATH)),
         "GuidedBridge.log_h": row(BRIDGE.log_h, t=("number", 0.5), x=("array", X)),
         "GuidedBridge.score": row(BRIDGE.score, t=("number", 0.5), x=("array", X)),
+        # trees
+        "Tree": row(
+            nb.Tree,
+            parents=("array", np.array([-1.0, 0.0, 0.0])),
+            lengths=("array", np.ones(2)),
+            names=("names?", [None, "a", "b"]),
+            observed=("array?", np.array([1.0])),
+        ),
+        "Tree.from_parents": row(
+            nb.Tree.from_parents,
+            parents=("array", np.array([2.0, 2.0, -1.0])),
+            lengths=("array", np.ones(3)),
+            names=("names?", ["a", "b", None]),
+            observed=("array?", np.array([0.0])),
+        ),
+        "Tree.from_newick": row(
+            nb.Tree.from_newick,
+            source=("path", "(a:1,b:2);"),
+            index=("count from 0?", 0),
+            preserve_underscores=("flag", True),
+            unit_lengths=("flag", False),
+        ),
+        "Tree.chain": row(nb.Tree.chain, times=("array", GRID), names=("names?", ["a", "b", "c"])),
+        "Tree.star": row(nb.Tree.star, lengths=("array", GRID), names=("names?", ["a", "b", "c"])),
+        "Tree.with_lengths": row(TREE.with_lengths, lengths=("array", np.ones(4))),
+        "Tree.scaled": row(TREE.scaled, rates=("array", np.ones(4))),
+        "Tree.clade": row(
+            lambda names, stem=True: TREE.clade(*(names if isinstance(names, list) else [names]), stem=stem),
+            names=("names", ["a", "b"]),
+            stem=("flag", True),
+        ),
+        "Tree.observing": row(TREE.observing, names=("names", ["a", "b"])),
+        "Tree.pruned": row(TREE.pruned, names=("names", ["a", "b"])),
+        "Tree.rows": row(TREE.rows, data=("mapping", dict.fromkeys("abc", SQUARE)), names="names?"),
         # estimates
         "estimate_evidence": row(
             nb.estimate_evidence,
@@ -775,7 +811,7 @@ WITH_METHODS += (
     nb.IntervalCensored,
     nb.Comparison,
 )
-WITH_METHODS += (scores.Training, scores.UNet)
+WITH_METHODS += (scores.Training, scores.UNet, nb.Tree)
 NOT_ASKED = {"DiffusionEndpoint.expand", "DiffusionEndpoint.mask", "DiffusionEndpoint.to_event"}
 NOT_ASKED |= {
     "DiffusionEndpoint.noise_prior",
