@@ -13,6 +13,7 @@ from .conditioning import (
 )
 from .distributions import (
     DiffusionEndpoint as DiffusionEndpoint,
+    DiffusionTree as DiffusionTree,
     NoiseReparam as NoiseReparam,
     sample as sample,
 )

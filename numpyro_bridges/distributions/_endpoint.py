@@ -22,7 +22,7 @@ from ..bridges import GuidedBridge
 from ..conditioning import AbstractMatch
 from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE, simulate, time_grid
-from ._batch import as_datum, as_shape, find_batched, one_of
+from ._batch import as_shape, find_batched, one_of
 from ._noise_driven import AbstractNoiseDriven
 
 
@@ -77,18 +77,18 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         if guide is not None:
             require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         batch_shape = as_shape(batch_shape, "batch_shape")
-        batched = _names(batched)
+        batched = names_of(batched)
         parts = {"sde": sde, "x0": x0, "match": match, "guide": guide}
-        names = find_batched(parts, batch_shape, batched, _check)
+        names = find_batched(parts, batch_shape, batched, check_law)
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
-        datum = jnp.zeros(_seen(one).shape)
+        datum = jnp.zeros(seen_shape(one))
         exact = one["match"].at(datum).exact
         given = {"t0": t0, "t1": t1, "ts": ts}
         times = {k: value if value is None else exact_float(value, k) for k, value in given.items()}
         parts["ts"], own = _grids(times, batch_shape, num_steps=num_steps, graded=exact)
         names += ("ts",) if own else ()
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
-        _close(parts, one, names, len(batch_shape))
+        close_parts(parts, one, names, len(batch_shape), one["ts"].elapsed)
         noise_shape = _bridge(one, datum).noise_shape
         declared = batched is not None
         plain = ("ts",) if ts is None else ()
@@ -108,14 +108,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
 
         NaN where the law is masked: the datum says nothing of that path, and no bridge leads to it.
         """
-        require(self.noise is not None, "`path` needs the noise: use `law.given(noise)`.")
-        observed = as_datum(observed, "observed")
-        self._check_value(observed, "observed")
-        observed = jnp.broadcast_to(observed, self.shape())
-        path = self._over_batch(_path, self._full_shape, observed, self.noise)
-        if self._mask is None:
-            return path
-        return jnp.where(self._mask.reshape(self._full_shape + (1,) * (path.ndim - self._mask.ndim)), path, jnp.nan)
+        return self._paths_to(observed, _path)
 
     @staticmethod
     def _observe(parts, key):
@@ -144,7 +137,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         parts["match"].at(rows.reshape(len(rows), -1) if len(values) > 1 else values[0])
 
 
-def _names(batched) -> tuple[str, ...] | None:
+def names_of(batched) -> tuple[str, ...] | None:
     """The declared parts. Times show by their shapes whether they are batched."""
     if batched is None:
         return None
@@ -194,7 +187,7 @@ def _bridge(parts, value) -> GuidedBridge:
     return GuidedBridge(parts["sde"], condition, x0=parts["x0"], ts=parts["ts"], guide=parts["guide"])
 
 
-def _close(parts, one, names, num_axes) -> None:
+def close_parts(parts, one, names, num_axes, ts) -> None:
     """Freezes what users' functions read, for one law and for the batch."""
 
     def set_closed(name, close):
@@ -203,7 +196,7 @@ def _close(parts, one, names, num_axes) -> None:
             close = eqx.filter_vmap(close)
         parts[name] = close(parts[name])
 
-    x0, ts = one["x0"], one["ts"].elapsed
+    x0 = one["x0"]
     set_closed("sde", lambda sde: sde.closed(ts[0], x0))
     if parts["guide"] is not None:
         set_closed("guide", lambda guide: guide.closed(one["sde"], x0, ts))
@@ -219,7 +212,7 @@ def _free_path(parts, key):
     return simulate(sde, x0, grid, jr.normal(key, shape, x0.dtype))
 
 
-def _seen(parts):
+def seen_shape(parts) -> tuple[int, ...]:
     """Shape of what is seen, by tracing one step and its observation."""
 
     def seen(t0, t1, x0, key):
@@ -227,10 +220,10 @@ def _seen(parts):
         return parts["match"].sample(key, sde, sde.transition(t0, t1, x0).mean)
 
     time = jax.ShapeDtypeStruct((), parts["x0"].dtype)  # no number: a coefficient may be defined on [t0, t1] only
-    return jax.eval_shape(seen, time, time, parts["x0"], jr.key(0))
+    return jax.eval_shape(seen, time, time, parts["x0"], jr.key(0)).shape
 
 
-def _check(parts):
+def check_law(parts):
     """Raises unless the parts make one law."""
     x0 = parts["x0"]
     require(
@@ -238,4 +231,4 @@ def _check(parts):
         f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Declare a batch of starts by `batch_shape`.",
     )
     parts["sde"].check_state(x0)
-    _seen(parts)
+    seen_shape(parts)

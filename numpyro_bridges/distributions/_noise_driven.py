@@ -168,6 +168,17 @@ class AbstractNoiseDriven(dist.Distribution):
         log_prob = jnp.where(True if mask is None else mask, log_prob, 0.0)
         return jnp.sum(log_prob, axis=tuple(range(-self._moved, 0)))
 
+    def _paths_to(self, observed, one):
+        """Paths of each datum by `one`, NaN where the law is masked."""
+        require(self.noise is not None, "`path` needs the noise: use `law.given(noise)`.")
+        observed = as_datum(observed, "observed")
+        self._check_value(observed, "observed")
+        observed = jnp.broadcast_to(observed, self.shape())
+        path = self._over_batch(one, self._full_shape, observed, self.noise)
+        if self._mask is None:
+            return path
+        return jnp.where(self._mask.reshape(self._full_shape + (1,) * (path.ndim - self._mask.ndim)), path, jnp.nan)
+
     def expand(self, batch_shape):
         return self._widened(as_shape(batch_shape, "batch_shape") + self.event_shape[: self._moved])
 

@@ -5,7 +5,7 @@ from ._continuous import (
     travel_continuous as travel_continuous,
     weight_rate as weight_rate,
 )
-from ._edge import arrive as arrive, retrace as retrace, travel as travel
+from ._edge import arrive as arrive, follow as follow, retrace as retrace, travel as travel
 from ._guides import (
     AbstractGuide as AbstractGuide,
     AbstractPlan as AbstractPlan,

@@ -59,6 +59,23 @@ def arrive(
     return x, steering.log_evidence() + seen.log_scale
 
 
+def follow(
+    sde: AbstractSDE,
+    plan: AbstractPlan,
+    seen: Observation,
+    ts: Float[Array, " K+1"],
+    x0: State,
+    noise: Float[Array, "K k *dim"],
+    observed: State,
+) -> tuple[Float[Array, "K n *dim"], Float[Array, ""]]:
+    """The states after x0, every step being guided, the last by `seen` itself, and the log weight Σ log p/q."""
+    path, x, log_weight = travel(sde, plan, ts, x0, noise[:-1], observed)
+    transition, steering = _last_step(sde, seen, ts, x, observed)
+    u, step_weight = steering.drive(noise[-1])
+    x = transition.mean + apply(transition.factor, u)
+    return jnp.concatenate([path, x[None]]), log_weight + step_weight
+
+
 def retrace(
     sde: AbstractSDE,
     plan: AbstractPlan,

@@ -157,7 +157,8 @@ class _RecedingPlan(AbstractPlan):
         return compose(self.operator, flow), shift, covariance
 
     def steer(self, step, transition, dt, x, observed):
-        return GaussianSteering(transition, *self._forecast(step, transition.covariance / dt), observed, self.exact)
+        a = transition.covariance / jnp.where(dt == 0, 1.0, dt)  # a branch of a tree may have no length
+        return GaussianSteering(transition, *self._forecast(step, a), observed, self.exact)
 
     def message(self, step, sde, t, x, observed):
         operator, shift, covariance = self._forecast(step, sde.covariance(t, x))

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import apply
+from .._linalg import apply, safe_sqrt
 from .._types import RealScalar, State
 from ..sdes import AbstractSDE
 from ._guides import AbstractPlan
@@ -45,7 +45,7 @@ class GridNoise(diffrax.AbstractBrownianPath):
         t1 = t0 if t1 is None else t1
         dt, z = t1 - t0, self.noise[self.index(jnp.asarray(t0))]
         if not issubclass(self.levy_area, diffrax.SpaceTimeLevyArea):
-            return jnp.sqrt(dt) * z
+            return safe_sqrt(dt) * z
         z, area = jnp.split(z, 2)
         W = jnp.sqrt(dt) * z
         return diffrax.SpaceTimeLevyArea(dt=dt, W=W, H=jnp.sqrt(dt / 12) * area) if use_levy else W
@@ -64,7 +64,8 @@ class GuidedTerm(diffrax.AbstractTerm):
         raise NotImplementedError("A guided step has a Gaussian law and no vector field; use `GuidedStep()`.")
 
     def contr(self, t0, t1, **kwargs):
-        return self.control.evaluate(t0, t1) / jnp.sqrt(t1 - t0)
+        dt = t1 - t0
+        return self.control.evaluate(t0, t1) / jnp.sqrt(jnp.where(dt == 0, 1.0, dt))  # a step may have no length
 
     def prod(self, vf, control):
         raise NotImplementedError("A guided step has a Gaussian law and no vector field; use `GuidedStep()`.")

@@ -6,7 +6,7 @@ States are `(n, dim)` or `(n,)`; σ acts on the first axis, so a = σσᵀ is n 
 import abc
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -16,7 +16,7 @@ from jax.extend.core import Literal
 from jaxtyping import Array, Float
 
 from .._checks import require, require_instance
-from .._linalg import add, apply, promote
+from .._linalg import add, apply, promote, safe_sqrt
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
 
@@ -71,6 +71,9 @@ class AbstractSDE(eqx.Module):
 
     space: eqx.AbstractVar[AbstractSpace | None]
     """Where states live; `None` is Euclidean space."""
+
+    has_exact_transition: ClassVar[bool] = False
+    """Whether a step of any length has its exact law, so that one is enough where nothing happens on the way."""
 
     @abc.abstractmethod
     def drift(self, t: RealScalar, x: State) -> State:
@@ -129,7 +132,7 @@ class AbstractSDE(eqx.Module):
         """The model's step from t0 to t1; Euler–Maruyama unless the class has its exact law."""
         dt = t1 - t0
         factor, covariance = self.noise(t0, x)
-        return Transition(x, dt * self.drift(t0, x), jnp.sqrt(dt) * factor, dt * covariance)
+        return Transition(x, dt * self.drift(t0, x), safe_sqrt(dt) * factor, dt * covariance)
 
     def transition_from(
         self, origin: State, t0: RealScalar, t1: RealScalar, y: State

@@ -6,6 +6,7 @@ The integrals are elementwise for a scalar or diagonal B, and by series and doub
 """
 
 from math import factorial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -99,6 +100,7 @@ class BrownianMotion(AbstractSDE):
 
     covariance_operator: Structured
     space: AbstractSpace | None
+    has_exact_transition: ClassVar[bool] = True
 
     def __init__(self, covariance: ArrayLike, *, space: AbstractSpace | None = None):
         self.covariance_operator = _covariance(covariance, "covariance")
@@ -140,6 +142,7 @@ class LinearSDE(AbstractSDE):
     diffusion_operator: Structured
     shift: Array
     space: AbstractSpace | None
+    has_exact_transition: ClassVar[bool] = True
 
     def __init__(
         self, drift: ArrayLike, diffusion: ArrayLike, shift: ArrayLike = 0.0, *, space: AbstractSpace | None = None

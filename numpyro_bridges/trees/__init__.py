@@ -1,3 +1,4 @@
 """Rooted trees: topology and names, branch lengths, data by name."""
 
+from ._sweep import TreeProblem as TreeProblem
 from ._tree import Tree as Tree

@@ -1,0 +1,214 @@
+"""The law of what is seen of a diffusion along the branches of a tree.
+
+`sample` simulates from the root and observes the nodes that are seen. `log_prob(v)`, with standard normal noise z
+bound, is the log weight Ψ of guided paths along all branches (`trees/_sweep.py`), so that
+
+    E[exp log_prob(v | z)] = p(v | x0),    z ~ N(0, I).
+
+A bridge is the tree with one branch, a time series is a chain.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+
+from .._checks import as_float, positive_integer, require, require_finite, require_instance
+from .._types import RealScalar, State
+from ..conditioning import AbstractMatch
+from ..guiding import AbstractGuide
+from ..sdes import AbstractSDE
+from ..trees import Tree, TreeProblem
+from ._batch import as_shape, find_batched, one_of
+from ._endpoint import check_law, close_parts, names_of, seen_shape
+from ._noise_driven import AbstractNoiseDriven
+
+
+class _Settings(eqx.Module):
+    """What is known of a law before tracing."""
+
+    num_steps: int = eqx.field(static=True)
+    per_node: tuple[str, ...] = eqx.field(static=True)
+
+
+class DiffusionTree(AbstractNoiseDriven):
+    """The law of observations at the seen nodes of a tree, of a diffusion that starts at the root.
+
+        law = DiffusionTree(flow, x0, InexactMatch(1e-4), tree=tree, num_steps=10)
+        nb.sample("tips", law, obs=tree.rows(shapes))
+
+    Daughters of a node start where their mother ended and go their own ways; what is not seen says nothing and costs
+    nothing.
+
+    **Arguments:**
+
+    - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths.
+    - `x0`: the state at the root, `(n, dim)` or `(n,)`.
+    - `match`: how a node is seen, the same for all, or one for each row with `per_node=("match",)`: every array with an
+      axis `(m,)` in front, as `jax.vmap` of a constructor returns it. So each tip has an error of its own, or its own
+      `mask` of an `InexactMatch`.
+    - `tree`: a `Tree`. Its lengths may be parameters.
+    - `num_steps`: steps on each branch; 1 unless given where the SDE has its exact transition (`LinearSDE`,
+      `BrownianMotion`).
+    - `t0`: the time at the root.
+    - `guide`: as for `GuidedBridge`, for every branch.
+    - `batch_shape`, `batched`: several trees with parts of their own, as for `DiffusionEndpoint`.
+
+    **Shapes:** `event_shape` is `(m, ...)`, one observation for each node of `tree.observed`; data come in that order
+    by `tree.rows`. The noise has shape `(branches * num_steps, k, dim)`, branches in preorder, those alone that lead to
+    something seen.
+
+    For a linear SDE with the default guide the density does not depend on the noise: it is the likelihood.
+
+    **Errors:** `ValueError` as for `DiffusionEndpoint`, for an exact match of an inner node, and for a seen root.
+    """
+
+    def __init__(
+        self,
+        sde: AbstractSDE,
+        x0: State,
+        match: AbstractMatch,
+        *,
+        tree: Tree,
+        num_steps: int | None = None,
+        t0: RealScalar = 0.0,
+        guide: AbstractGuide | None = None,
+        per_node: tuple[str, ...] = (),
+        batch_shape: tuple[int, ...] = (),
+        batched: tuple[str, ...] | None = None,
+        validate_args: bool | None = None,
+    ):
+        require_instance(match, AbstractMatch, "match", "a model of observation, such as `InexactMatch(variance)`")
+        match.check_density()
+        x0 = as_float(x0, "x0")
+        require_finite(x0, "x0")
+        require_instance(sde, AbstractSDE, "sde", "an SDE, such as `LinearSDE(drift, diffusion)`")
+        require_instance(tree, Tree, "tree", "a `Tree`, such as `Tree.from_newick(text)`")
+        if guide is not None:
+            require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
+        require(0 not in tree.observed, "`tree` must not have its root among the seen nodes: `x0` is where it is.")
+        own = names_of(per_node) or ()
+        require(set(own) <= {"match"}, f"`per_node` may hold 'match'; got {per_node}.")
+        require(
+            num_steps is not None or sde.has_exact_transition,
+            "`num_steps` must be given, for every branch: this SDE is stepped by Euler's scheme.",
+        )
+        settings = _Settings(positive_integer(1 if num_steps is None else num_steps, "num_steps"), own)
+        batch_shape = as_shape(batch_shape, "batch_shape")
+        declared = names_of(batched)
+        start = as_float(t0, "t0")
+        require(start.ndim == 0, f"`t0` must be one time; got shape {start.shape}.")
+        parts = {"sde": sde, "x0": x0, "match": match, "guide": guide, "tree": tree, "t0": start, "settings": settings}
+        names = find_batched(parts, batch_shape, declared, _check)
+        one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
+        datum = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(one))))
+        _check_exact(one, datum)
+        close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1))
+        branches = len(_problem(one, datum).schedule.active)
+        columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
+        noise_shape = (branches * settings.num_steps, one["sde"].noise_size(one["x0"]), columns)
+        super().__init__(
+            parts, names, declared is not None, batch_shape, datum.shape, noise_shape, validate_args, ("t0",)
+        )
+
+    @property
+    def tree(self) -> Tree:
+        """The tree of the law."""
+        return self.parts["tree"]
+
+    def path(self, observed):
+        """Paths to `observed` that the bound noise drives, batch axes and then `(branches, num_steps + 1, n, dim)`.
+
+        Branches in preorder, those that lead to something seen; the first state of each is the last of its parent's.
+        NaN where the law is masked.
+        """
+        return self._paths_to(observed, _paths)
+
+    @staticmethod
+    def _observe(parts, key):
+        return _simulated(parts, key)[0]
+
+    @staticmethod
+    def _simulate(parts, key):
+        seen, paths = _simulated(parts, key)
+        noise = _problem(parts, seen).noise_from_paths(paths, jr.fold_in(key, 2))
+        return seen, noise if noise.ndim == 3 else noise[..., None]
+
+    @staticmethod
+    def _log_weight(parts, value, noise):
+        return _problem(parts, value).log_weight(_driving(parts, noise))
+
+    @staticmethod
+    def _placeholder(parts, value):
+        return _simulated(parts, jr.key(0))[0].astype(value.dtype)
+
+    @staticmethod
+    def _check_data(parts, values):
+        """Row by row, each by its own match where they have some."""
+        match = parts["match"]
+        for row in np.swapaxes(values, 0, 1):
+            match.at(row[0])
+
+
+def _of_one_node(parts):
+    """The parts of the law of one node."""
+    own = parts["settings"].per_node
+    return {name: jax.tree.map(lambda a: a[0], part) if name in own else part for name, part in parts.items()}
+
+
+def _check(parts):
+    """Raises unless the parts make one law."""
+    rows = len(parts["tree"].observed)
+    for name in parts["settings"].per_node:
+        for leaf in jax.tree.leaves(parts[name]):
+            require(
+                leaf.ndim > 0 and leaf.shape[0] == rows,
+                f"`{name}` is in `per_node`, so every array of it must have {rows} rows, one for each seen node; got "
+                f"shape {leaf.shape}. Build it by `jax.vmap`.",
+            )
+    check_law(_of_one_node(parts))
+
+
+def _check_exact(parts, datum):
+    tree = parts["tree"]
+    if not _of_one_node(parts)["match"].at(datum[0]).exact:
+        return
+    inner = [node for node in tree.observed if node not in tree.tips]
+    require(
+        not inner,
+        f"`match` must have an error where inner nodes are seen, and {len(inner)} of the seen nodes are no tips: use "
+        "an `InexactMatch` of a small variance.",
+    )
+
+
+def _problem(parts, value) -> TreeProblem:
+    match, own = parts["match"], parts["settings"].per_node
+    conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if "match" in own else None, 0))(match, value)
+    steps = parts["settings"].num_steps
+    return TreeProblem.of(parts["sde"], parts["guide"], parts["x0"], parts["tree"], conditions, steps, parts["t0"])
+
+
+def _driving(parts, noise):
+    """Noise as the sweep takes it: a vector state has no columns."""
+    return noise[..., 0] if parts["x0"].ndim == 1 else noise
+
+
+def _paths(parts, value, noise):
+    return _problem(parts, value).paths(_driving(parts, noise))
+
+
+def _simulated(parts, key):
+    """What is seen, and the paths of the branches that lead to it."""
+    key_path, key_seen = jr.split(key)
+    tree, sde, match, own = parts["tree"], parts["sde"], parts["match"], parts["settings"].per_node
+    blank = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(parts))), parts["x0"].dtype)
+    problem = _problem(parts, blank)
+    x0, branches = problem.x0, problem.schedule.active
+    shape = (len(branches) * problem.num_steps, sde.noise_size(x0), *x0.shape[1:])
+    paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))
+    row = {node: i for i, node in enumerate(branches)}
+    ends = paths[np.array([row[node] for node in tree.observed]), -1]
+    keys = jr.split(key_seen, len(ends))
+    draw = jax.vmap(lambda match, key, x: match.sample(key, sde, x), in_axes=(0 if "match" in own else None, 0, 0))
+    return draw(match, keys, ends), paths
