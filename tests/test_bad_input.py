@@ -385,6 +385,23 @@ def table() -> dict[str, Row]:
             validate_args="free",
             **GUIDED,
         ),
+        "DiffusionTree": row(
+            nb.DiffusionTree,
+            True,
+            lambda law: law.parts,
+            {"x0": "x0"},
+            sde=("sde", OU),
+            x0=("array", X),
+            match=("match", MATCH),
+            tree=("tree", TREE),
+            num_steps=("count", 1),
+            t0=("number", 0.5),
+            guide="guide?",
+            per_node="free",
+            batch_shape="shape",
+            batched="names?",
+            validate_args="free",
+        ),
         "DiffusionEndpoint.given": row(
             LAW.given, False, lambda law: law.noise, noise=("array", NOISE)
         ),

@@ -50,6 +50,9 @@ KERNEL = nb.GaussianKernel(0.3, 0.7)
 GBM = nb.SDE(lambda t, x, args: -x, lambda t, x, args: 0.5 + 0.2 * jnp.sin(x[:, 0]), space=POINTS)
 PLAIN = nb.LinearSDE(-0.3, np.array([0.4, 0.3, 0.5]), space=POINTS)
 ACTUAL = nb.InexactMatch(0.05).at(SEEN)
+TREE = nb.Tree.from_newick("((a:0.5,b:0):0.3,c:1);")
+SEVERAL = np.stack([SEEN, X0, 0.5 * SEEN])
+ROWS = jax.vmap(nb.InexactMatch)(np.array([0.05, 0.1, 0.07]))
 
 
 def noise(shape):
@@ -268,6 +271,23 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
         nb.DiffusionEndpoint,
         LAW | {"x0": times(BATCH), "batch_shape": (2,), "batched": ("x0",)},
         lambda law: observed(law, BATCH),
+    ),
+    "Tree": (
+        nb.Tree,
+        {"lengths": times([0.5, 1.0, 0.7]), "parents": (-1, 0, 1, 1), "names": list("rabc"), "observed": [1, 2, 3]},
+        lambda tree: jnp.sum(tree.depths),
+    ),
+    "DiffusionTree": (
+        nb.DiffusionTree,
+        {"sde": GBM, "x0": times(X0), "match": ROWS, "tree": Of(lambda t: TREE.scaled(t)), "num_steps": 2}
+        | {"t0": times(0.1), "guide": nb.RecedingGuide(0.1), "per_node": ("match",)},
+        lambda law: observed(law, SEVERAL),
+    ),
+    "DiffusionTree, batch": (
+        nb.DiffusionTree,
+        {"sde": PLAIN, "x0": times(BATCH), "match": nb.InexactMatch(0.05), "tree": TREE, "num_steps": 1}
+        | {"batch_shape": (2,), "batched": ("x0",)},
+        lambda law: observed(law, np.stack([SEVERAL, SEVERAL])),
     ),
 }  # fmt: skip
 

@@ -291,7 +291,7 @@ class AbstractNoiseDriven(dist.Distribution):
     def _check_seen(self, data, seen):
         """All data at once; one after the other to name the one that is wrong, or where each has its own match."""
         batched = tuple({"match"} & set(self._batched))
-        match = {"match": self.parts["match"]}
+        match = {name: self.parts[name] for name in ("match", "settings") if name in self.parts}
         if not seen.any() or not batched and _passes(self._check_data, match, data[seen]):
             return
         for index in map(tuple, np.argwhere(seen)):

@@ -146,9 +146,11 @@ class DiffusionTree(AbstractNoiseDriven):
     @staticmethod
     def _check_data(parts, values):
         """Row by row, each by its own match where they have some."""
-        match = parts["match"]
-        for row in np.swapaxes(values, 0, 1):
-            match.at(row[0])
+        own = "match" in parts["settings"].per_node
+        for i, row in enumerate(np.swapaxes(values, 0, 1)):
+            match = jax.tree.map(lambda a, i=i: a[i], parts["match"]) if own else parts["match"]
+            for value in row:
+                match.at(value)
 
 
 def _of_one_node(parts):

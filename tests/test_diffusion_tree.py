@@ -1,0 +1,378 @@
+"""Laws on trees: the dense joint normal of linear processes, brute force for nonlinear ones, the way back to noise."""
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from numpyro.infer import MCMC, NUTS, Predictive
+from scipy import stats
+
+import numpyro_bridges as nb
+from numpyro_bridges.distributions._tree import _problem, _simulated
+from numpyro_bridges.infer import FunctionSpaceHMC
+from numpyro_bridges.trees._schedule import schedule
+
+pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
+
+Q = np.array([[0.5, 0.1, 0.05], [0.1, 0.4, -0.1], [0.05, -0.1, 0.3]])
+X0 = np.array([[0.3, -0.2], [0.9, 0.4], [-0.6, 0.1]])
+TEXT = "((a:1,b:1.5)x:2,(c:3,d:.5,(e:1,f:0):.2):0.1,g:2,(u:1):1):.3;"
+SEEN = ["a", "b", "c", "d", "e", "f", "g", "x"]  # u is missing, x is an inner node
+TREE = nb.Tree.from_newick(TEXT).observing(SEEN)
+DATA = np.random.default_rng(0).normal(size=(len(SEEN), 3, 2))
+
+
+def random_tree(seed, count, zeros=True):
+    """Nodes in any order, polytomies, unifurcations, lengths of 0, some inner nodes seen and some tips not."""
+    rng = np.random.default_rng(seed)
+    parents = [-1] + [int(rng.integers(max(0, i - 6), i)) for i in range(1, count)]
+    lengths = rng.exponential(size=count)
+    if zeros:
+        lengths = np.where(rng.random(count) < 0.15, 0.0, lengths)
+    tips = [i for i in range(1, count) if i not in parents]
+    inner = [i for i in range(1, count) if i in parents]
+    seen = [i for i in tips if rng.random() < 0.8] + [i for i in inner if rng.random() < 0.2]
+    return nb.Tree.from_parents(parents, lengths, [f"n{i}" for i in range(count)], seen or tips)
+
+
+def shared_times(tree):
+    """For each pair of seen nodes the time that their lineages share, by walking up."""
+
+    def lineage(node):
+        return [node] if node == 0 else [node, *lineage(tree.parents[node])]
+
+    above = [set(lineage(node)) for node in tree.observed]
+    shared = np.zeros((len(above), len(above), tree.num_nodes))
+    for i, first in enumerate(above):
+        for j, second in enumerate(above):
+            shared[i, j, sorted(first & second)] = 1.0
+    lengths = jnp.concatenate([jnp.zeros(1), tree.lengths])
+    return jnp.asarray(shared) @ lengths
+
+
+def joint(tree, x0, data, a, noise, rate=None, shift=0.0):
+    """Log density of all rows of data by one dense normal: dX = (shift − rate X) dt + √a dW, errors of each row."""
+    shared = shared_times(tree)
+    depth = jnp.diagonal(shared)
+    if rate is None:
+        C, decay, drift = shared, jnp.ones_like(depth), shift * depth
+    else:
+        C = jnp.exp(-rate * (depth[:, None] + depth[None])) * jnp.expm1(2 * rate * shared) / (2 * rate)
+        decay = jnp.exp(-rate * depth)
+        drift = shift * -jnp.expm1(-rate * depth) / rate
+    mean = decay[:, None, None] * x0 + drift[:, None, None]
+    m, n = data.shape[:2]
+    covariance = jnp.kron(C, a) + jnp.diag(jnp.repeat(jnp.broadcast_to(noise, (m,)), n))
+    r = (data - mean).reshape(m * n, -1)
+    L = jnp.linalg.cholesky(covariance)
+    y = jax.scipy.linalg.solve_triangular(L, r, lower=True)
+    return -0.5 * jnp.sum(y * y) - r.shape[1] * (jnp.sum(jnp.log(jnp.diagonal(L))) + 0.5 * m * n * jnp.log(2 * jnp.pi))
+
+
+def brownian(p, tree, **settings):
+    match = jax.vmap(nb.InexactMatch)(p["noise"])
+    return nb.DiffusionTree(
+        nb.BrownianMotion(p["a"]), p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_node=("match",), **settings
+    )
+
+
+def ornstein_uhlenbeck(p, tree, **settings):
+    match = jax.vmap(nb.InexactMatch)(p["noise"])
+    sde = nb.LinearSDE(-p["rate"], jnp.linalg.cholesky(p["a"]), p["shift"])
+    return nb.DiffusionTree(
+        sde, p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_node=("match",), **settings
+    )
+
+
+LINEAR = {
+    "Brownian": (brownian, {}),
+    "Ornstein-Uhlenbeck": (ornstein_uhlenbeck, {"rate": 0.7, "shift": 0.4}),
+}
+
+
+def parameters(tree, n, seed, **more):
+    rng = np.random.default_rng(seed)
+    m = len(tree.observed)
+    root = rng.normal(size=(n, n))
+    p = {"a": root @ root.T + np.eye(n), "x0": rng.normal(size=(n, 2)), "noise": rng.uniform(0.02, 0.3, m)}
+    p |= {"lengths": tree.lengths, **more}
+    return {name: jnp.asarray(x) for name, x in p.items()}, rng.normal(size=(m, n, 2))
+
+
+@pytest.mark.parametrize("name", LINEAR)
+@pytest.mark.parametrize("count", [2, 6, 60])
+def test_linear_processes_have_the_dense_normal(name, count):
+    """Value to 1e-8, gradients in every parameter and length to 1e-6, whatever the noise."""
+    make, more = LINEAR[name]
+    tree = random_tree(count, count)
+    p, data = parameters(tree, 2, count, **more)
+
+    def ours(p):
+        law = make(p, tree)
+        return law.given(jnp.ones(law.noise_prior().shape())).log_prob(data)
+
+    def truth(p):
+        own = {key: p[key] for key in more}
+        return joint(tree.with_lengths(p["lengths"]), p["x0"], data, p["a"], p["noise"], **own)
+
+    found, slopes = jax.jit(jax.value_and_grad(ours))(p)
+    expected, true_slopes = jax.jit(jax.value_and_grad(truth))(p)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+    symmetric = lambda slopes: slopes | {"a": slopes["a"] + slopes["a"].T}  # noqa: E731
+    slopes, true_slopes = symmetric(slopes), symmetric(true_slopes)
+    for key in p:
+        size = 1 + np.max(np.abs(true_slopes[key]))
+        np.testing.assert_allclose(slopes[key], true_slopes[key], rtol=1e-6, atol=1e-6 * size, err_msg=key)
+
+
+def test_a_thousand_tips():
+    """Beside a pruning that is written here for one number per tip."""
+    tree = random_tree(3, 2600, zeros=False)
+    p, data = parameters(tree, 1, 3)
+    law = brownian(p, tree)
+    found = jax.jit(lambda law: law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data))(law)
+
+    lengths, a = np.concatenate([[0.0], tree.lengths]), float(p["a"][0, 0])
+    precision, pull, log_scale = np.zeros(tree.num_nodes), np.zeros((tree.num_nodes, 2)), 0.0
+    row = {node: i for i, node in enumerate(tree.observed)}
+    for node in reversed(range(1, tree.num_nodes)):
+        h, f = precision[node], pull[node]
+        if node in row:
+            s = float(p["noise"][row[node]])
+            h, f = h + 1 / s, f + data[row[node], 0] / s
+            log_scale -= np.log(2 * np.pi * s) + 0.5 * np.sum(data[row[node], 0] ** 2) / s
+        if h == 0:
+            continue
+        t = lengths[node] * a
+        log_scale += 0.5 * np.sum(f**2) * t / (1 + h * t) - np.log(1 + h * t)
+        precision[tree.parents[node]] += h / (1 + h * t)
+        pull[tree.parents[node]] += f / (1 + h * t)
+    x0 = np.asarray(p["x0"])[0]
+    truth = log_scale + pull[0] @ x0 - 0.5 * precision[0] * np.sum(x0**2)
+    assert len(tree.observed) > 1000
+    np.testing.assert_allclose(found, truth, rtol=1e-9)
+
+
+@pytest.mark.parametrize("guide", [nb.FrozenGuide(nb.LinearSDE(-0.7, np.linalg.cholesky(Q), 0.4)), nb.RecedingGuide()])
+def test_paths_of_a_linear_process_have_one_weight(guide, key):
+    """With every step taken, the weight is the likelihood for each noise: no constant is lost on the way down."""
+    sde = nb.LinearSDE(-0.7, np.linalg.cholesky(Q), 0.4)
+    law = nb.DiffusionTree(sde, X0, nb.InexactMatch(0.1), tree=TREE, num_steps=3, guide=guide)
+    truth = joint(TREE, X0, DATA, Q, 0.1, 0.7, 0.4)
+    z = jr.normal(key, (4, *law.noise_prior().shape()))
+    found = jax.jit(lambda z: law.expand((4,)).given(z).log_prob(jnp.broadcast_to(DATA, (4, *DATA.shape))))(z)
+    np.testing.assert_allclose(found, np.full(4, truth), rtol=1e-9)
+
+
+def test_a_star_is_a_product_and_the_order_of_children_makes_no_difference():
+    sde, match = nb.LinearSDE(-0.7, 0.6, 0.4), nb.InexactMatch(0.1)
+
+    def density(law, data):
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data)
+
+    star = nb.Tree.star([0.5, 1.0, 2.0], ["a", "b", "c"])
+    one_by_one = [
+        density(nb.DiffusionEndpoint(sde, X0, match, t1=t, num_steps=1), v)
+        for t, v in zip([0.5, 1.0, 2.0], DATA[:3], strict=True)
+    ]
+    found = density(nb.DiffusionTree(sde, X0, match, tree=star), DATA[:3])
+    np.testing.assert_allclose(found, sum(one_by_one), rtol=1e-11)
+
+    turned = nb.Tree.from_newick("((u:1):1,g:2,((f:0,e:1):.2,d:.5,c:3):0.1,(b:1.5,a:1)x:2):.3;").observing(SEEN)
+    rows = dict(zip(TREE.observed_names, DATA, strict=True))
+    laws = [nb.DiffusionTree(sde, X0, match, tree=tree) for tree in (TREE, turned)]
+    values = [density(law, law.tree.rows(rows)) for law in laws]
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-11)
+
+
+def test_masks_of_their_own():
+    """Landmarks that are missing in some tips say nothing: the dense normal of what is there."""
+    seen = np.random.default_rng(1).random((len(SEEN), 3)) < 0.7
+    match = jax.vmap(lambda mask: nb.InexactMatch(0.1, mask=mask))(jnp.asarray(seen))
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, match, tree=TREE, per_node=("match",))
+    found = law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
+    rows = seen.ravel()
+    C = np.kron(shared_times(TREE), Q) + 0.1 * np.eye(rows.size)
+    r = (DATA - X0).reshape(rows.size, 2)
+    truth = sum(stats.multivariate_normal(None, C[rows][:, rows]).logpdf(r[rows, c]) for c in (0, 1))
+    np.testing.assert_allclose(found, truth, rtol=1e-8)
+
+
+# Nonlinear processes.
+
+
+def sine(p):
+    return nb.SDE(lambda t, x, a: a * jnp.sin(x) + 0.2 * t, lambda t, x, a: 0.6 + 0.1 * jnp.cos(x), p)
+
+
+SMALL = nb.Tree.from_newick("((a:.5,b:.7):.4,c:.6);")
+LARGE = nb.Tree.from_newick("(((a:.3,b:.4)x:.2,c:0):.3,(d:.2,(e:.1,f:.3):.2):.1);")
+
+
+@pytest.mark.parametrize("num_steps", [4, 10])
+@pytest.mark.parametrize("tree", [SMALL, LARGE.observing(list("abcdef") + ["x"])], ids=["three tips", "six tips"])
+def test_evidence_by_brute_force(tree, num_steps):
+    """The mean weight, against forward simulation in NumPy weighed by the density of the data."""
+    rng = np.random.default_rng(num_steps)
+    variance, x0, count = 0.3, 0.4, 400_000
+    data = rng.normal(0.5, 0.4, (len(tree.observed), 1))
+    depths, lengths = np.asarray(tree.depths), np.asarray(tree.lengths)
+    state, log_density = {0: np.full(count, x0)}, np.zeros(count)
+    for node in range(1, tree.num_nodes):
+        x, t = state[tree.parents[node]], depths[tree.parents[node]]
+        dt = lengths[node - 1] / num_steps
+        for _ in range(num_steps):
+            spread = 0.6 + 0.1 * np.cos(x)
+            x = x + dt * (np.sin(x) + 0.2 * t) + np.sqrt(dt) * spread * rng.normal(size=count)
+            t = t + dt
+        state[node] = x
+        if node in tree.observed:
+            v = data[tree.observed.index(node), 0]
+            log_density += stats.norm(x, np.sqrt(variance)).logpdf(v)
+    weights = np.exp(log_density)
+    truth, error = weights.mean(), weights.std() / np.sqrt(count)
+    assert error < 0.01 * truth
+
+    law = nb.DiffusionTree(sine(1.0), np.array([x0]), nb.InexactMatch(variance), tree=tree, num_steps=num_steps)
+    z = jr.normal(jr.key(num_steps), (6000, *law.noise_prior().shape()))
+    log_weights = jax.jit(jax.vmap(lambda z: law.given(z).log_prob(data)))(z)
+    own = np.exp(log_weights)
+    own_error = own.std() / np.sqrt(len(own))
+    assert own_error < 0.01 * truth
+    assert abs(own.mean() - truth) < 4 * np.hypot(error, own_error)
+
+
+FLOW = nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(0.4, 0.7))
+KINDS = {
+    "inexact, inner node seen": (nb.InexactMatch(0.1), TREE, None),
+    "exact": (nb.ExactMatch(), nb.Tree.from_newick("((a:1,b:1.5):2,(c:3,d:.5):.3,g:2):.3;"), None),
+    "some points": (nb.InexactMatch(0.1, PICK := np.eye(3)[[2, 0]]), TREE, nb.FrozenGuide()),
+    "chain": (nb.InexactMatch(0.1), nb.Tree.chain([0.5, 0.7, 2.0]), None),
+    "one branch": (nb.ExactMatch(), nb.Tree.star([1.2]), None),
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_way_back_to_the_noise(name, key):
+    """Simulated paths are those of their noise; paths meet at the nodes, and end in what is seen exactly."""
+    match, tree, guide = KINDS[name]
+    law = nb.DiffusionTree(FLOW, X0, match, tree=tree, num_steps=3, guide=guide)
+
+    @jax.jit
+    def there_and_back(key):
+        seen, paths = _simulated(law.parts, key)
+        problem = _problem(law.parts, seen)
+        noise = problem.noise_from_paths(paths, key)
+        return seen, paths, problem.paths(noise), problem.log_weight(noise)
+
+    seen, paths, again, log_weight = there_and_back(key)
+    np.testing.assert_allclose(again, paths, atol=1e-10)
+    assert np.isfinite(log_weight)
+    walk = schedule(tree.parents, tree.observed)
+    for i, node in enumerate(walk.active):
+        parent = tree.parents[node]
+        start = X0 if parent == 0 else paths[walk.active.index(parent), -1]
+        np.testing.assert_allclose(paths[i, 0], start, atol=1e-12)
+    if isinstance(match, nb.ExactMatch):
+        ends = [paths[walk.active.index(node), -1] for node in tree.observed]
+        np.testing.assert_allclose(ends, seen, atol=1e-12)
+
+
+def test_one_branch_is_an_endpoint(key):
+    """The same weight and path for the same noise."""
+    endpoint = nb.DiffusionEndpoint(FLOW, X0, nb.InexactMatch(0.1), t1=1.2, num_steps=3)
+    branch = nb.DiffusionTree(FLOW, X0, nb.InexactMatch(0.1), tree=nb.Tree.star([1.2]), num_steps=3)
+    z = jr.normal(key, endpoint.noise_prior().shape())
+    assert branch.noise_prior().shape() == z.shape
+    np.testing.assert_allclose(
+        branch.given(z).log_prob(DATA[:1]), endpoint.given(z).log_prob(DATA[0]), rtol=1e-8
+    )
+    np.testing.assert_allclose(branch.given(z).path(DATA[:1])[0], endpoint.given(z).path(DATA[0]), atol=1e-6)
+
+
+# In NumPyro.
+
+
+def model(data=None, tree=SMALL):
+    rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
+    sde = nb.BrownianMotion(rate)
+    nb.sample("tips", nb.DiffusionTree(sde, np.zeros((4, 2)), nb.InexactMatch(0.05), tree=tree), obs=data)
+
+
+def test_posterior_of_a_rate():
+    """By two kernels against quadrature; its width is that of all tips together."""
+    data = np.random.default_rng(2).normal(size=(3, 4, 2))
+    log_rates = np.linspace(-3, 3, 400)
+    log_density = [
+        stats.norm(0, 0.5).logpdf(r) + joint(SMALL, np.zeros((4, 2)), data, np.exp(r) * np.eye(4), 0.05)
+        for r in log_rates
+    ]
+    w = np.exp(log_density - np.max(log_density))
+    mean = np.sum(w * log_rates) / w.sum()
+    sd = np.sqrt(np.sum(w * (log_rates - mean) ** 2) / w.sum())
+    for kernel in (FunctionSpaceHMC(model), NUTS(model)):
+        mcmc = MCMC(kernel, num_warmup=200, num_samples=1500, progress_bar=False)
+        mcmc.run(jr.key(0), data, extra_fields=("~z.tips_noise",))
+        draws = np.log(mcmc.get_samples()["rate"])
+        assert abs(draws.mean() - mean) < 0.2 * sd and draws.std() == pytest.approx(sd, rel=0.15)
+
+
+def test_prior_predictive():
+    """Tips have the covariance of the tree."""
+    fixed = numpyro.handlers.condition(model, {"rate": 0.8})
+    draws = np.asarray(Predictive(fixed, num_samples=4000)(jr.key(1))["tips"])
+    assert draws.shape == (4000, 3, 4, 2)
+    values = draws.transpose(0, 2, 3, 1).reshape(-1, 3)
+    truth = 0.8 * np.asarray(shared_times(SMALL)) + 0.05 * np.eye(3)
+    error = np.sqrt((np.outer(np.diag(truth), np.diag(truth)) + truth**2) / len(values))
+    assert np.all(np.abs(values.T @ values / len(values) - truth) < 4.5 * error)
+
+
+def test_branch_lengths_have_priors():
+    def clock(data):
+        rates = numpyro.sample("rates", dist.LogNormal(0.0, 0.5).expand([SMALL.num_nodes - 1]).to_event(1))
+        law = nb.DiffusionTree(nb.BrownianMotion(1.0), np.zeros(2), nb.InexactMatch(0.05), tree=SMALL.scaled(rates))
+        nb.sample("tips", law, obs=data)
+
+    data = np.random.default_rng(2).normal(size=(3, 2))
+    mcmc = MCMC(FunctionSpaceHMC(clock), num_warmup=50, num_samples=50, progress_bar=False)
+    mcmc.run(jr.key(0), data)
+    assert np.all(np.isfinite(mcmc.get_samples()["rates"]))
+
+
+WRONG = {
+    "tree": (lambda: law(tree="(a:1);"), "`tree` must be a `Tree`"),
+    "match": (lambda: law(match=nb.FrozenGuide()), "`match` must be a model of observation"),
+    "root": (lambda: law(tree=nb.Tree([-1, 0], [1.0], None, [0, 1])), "`tree` must not have its root among"),
+    "steps": (lambda: law(sde=sine(1.0)), "`num_steps` must be given"),
+    "no steps": (lambda: law(num_steps=0), "`num_steps` must be a positive integer; got 0"),
+    "inner exact": (lambda: law(match=nb.ExactMatch()), "1 of the seen nodes are no tips"),
+    "per_node": (lambda: law(per_node=("sde",)), "`per_node` may hold 'match'"),
+    "rows of matches": (
+        lambda: law(match=jax.vmap(nb.InexactMatch)(jnp.ones(3)), per_node=("match",)),
+        "`match` is in `per_node`, so every array of it must have 8 rows",
+    ),
+    "data": (lambda: density(DATA[:3]), r"`value`, an observation, must have shape \(8, 3, 2\)"),
+    "several trees": (lambda: density(np.stack([DATA, DATA])), "holds 2 observations.*One noise shared"),
+    "NaN": (lambda: density(np.where(DATA > 1, np.nan, DATA)), "finite"),
+    "start": (lambda: law(x0=np.zeros((2, 3, 2))), r"`x0` must be one state"),
+}
+
+
+def law(sde=None, x0=X0, match=None, tree=TREE, **settings):
+    sde = nb.BrownianMotion(Q) if sde is None else sde
+    return nb.DiffusionTree(sde, x0, nb.InexactMatch(0.1) if match is None else match, tree=tree, **settings)
+
+
+def density(data):
+    return law().given(np.zeros(law().noise_prior().shape())).log_prob(data)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_refused(name):
+    make, message = WRONG[name]
+    with pytest.raises(ValueError, match=message):
+        make()
