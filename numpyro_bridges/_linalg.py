@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 from ._types import State, Structured
 
@@ -111,7 +111,7 @@ def promote(A: Structured, ndim: int, n: int) -> Structured:
     return diagonal_matrix(A, n) if A.ndim == 1 and ndim == 2 else A
 
 
-def safe_sqrt(x: Array) -> Array:
+def safe_sqrt(x: ArrayLike) -> Array:
     """√x whose derivative at exactly 0 is 0, where that of √x is infinite: of |y| = √y² the mean of both sides."""
     zero = x == 0
     # the inner `where` keeps the infinite slope, the outer one the value 1, out of the result
