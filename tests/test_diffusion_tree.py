@@ -350,6 +350,7 @@ WRONG = {
     "steps": (lambda: law(sde=sine(1.0)), "`num_steps` must be given"),
     "no steps": (lambda: law(num_steps=0), "`num_steps` must be a positive integer; got 0"),
     "inner exact": (lambda: law(match=nb.ExactMatch()), "1 of the seen nodes are no tips"),
+    "bins": (lambda: law(match=nb.IntervalCensored([0.0])), "`match` must see a value at each node"),
     "per_node": (lambda: law(per_node=("sde",)), "`per_node` may hold 'match'"),
     "rows of matches": (
         lambda: law(match=jax.vmap(nb.InexactMatch)(jnp.ones(3)), per_node=("match",)),

@@ -61,7 +61,8 @@ class DiffusionTree(AbstractNoiseDriven):
 
     For a linear SDE with the default guide the density does not depend on the noise: it is the likelihood.
 
-    **Errors:** `ValueError` as for `DiffusionEndpoint`, for an exact match of an inner node, and for a seen root.
+    **Errors:** `ValueError` as for `DiffusionEndpoint`, for `IntervalCensored`, for an exact match of an inner node,
+    and for a seen root.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class DiffusionTree(AbstractNoiseDriven):
         names = find_batched(parts, batch_shape, declared, _check)
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
         datum = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(one))))
-        _check_exact(one, datum)
+        _check_condition(one, datum)
         close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1))
         branches = len(_problem(one, datum).schedule.active)
         columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
@@ -172,9 +173,13 @@ def _check(parts):
     check_law(_of_one_node(parts))
 
 
-def _check_exact(parts, datum):
-    tree = parts["tree"]
-    if not _of_one_node(parts)["match"].at(datum[0]).exact:
+def _check_condition(parts, datum):
+    tree, condition = parts["tree"], _of_one_node(parts)["match"].at(datum[0])
+    require(
+        condition.num_extra_noises == 0,
+        "`match` must see a value at each node, such as `InexactMatch(variance)`: branches are not led to sets.",
+    )
+    if not condition.exact:
         return
     inner = [node for node in tree.observed if node not in tree.tips]
     require(
