@@ -19,7 +19,7 @@ from .._types import RealScalar, State
 from ..conditioning import AbstractMatch
 from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE
-from ..trees import Tree, TreeProblem
+from ..trees import Tree, TreeProblem, schedule
 from ._batch import as_shape, find_batched, one_of
 from ._endpoint import check_law, close_parts, names_of, seen_shape
 from ._noise_driven import AbstractNoiseDriven
@@ -106,7 +106,7 @@ class DiffusionTree(AbstractNoiseDriven):
         datum = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(one))))
         _check_condition(one, datum)
         close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1))
-        branches = len(_problem(one, datum).schedule.active)
+        branches = len(schedule(tree.parents, tree.observed).active)
         columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
         noise_shape = (branches * settings.num_steps, one["sde"].noise_size(one["x0"]), columns)
         super().__init__(
@@ -190,6 +190,11 @@ def _check_condition(parts, datum):
 
 
 def _problem(parts, value) -> TreeProblem:
+    """What is weighed."""
+    return _unled(parts, value).anchored(parts["t0"])
+
+
+def _unled(parts, value) -> TreeProblem:
     match, own = parts["match"], parts["settings"].per_node
     conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if "match" in own else None, 0))(match, value)
     steps = parts["settings"].num_steps
@@ -210,7 +215,7 @@ def _simulated(parts, key):
     key_path, key_seen = jr.split(key)
     tree, sde, match, own = parts["tree"], parts["sde"], parts["match"], parts["settings"].per_node
     blank = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(parts))), parts["x0"].dtype)
-    problem = _problem(parts, blank)
+    problem = _unled(parts, blank)
     x0, branches = problem.x0, problem.schedule.active
     shape = (len(branches) * problem.num_steps, sde.noise_size(x0), *x0.shape[1:])
     paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))

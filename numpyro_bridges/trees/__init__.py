@@ -1,4 +1,5 @@
 """Rooted trees: topology and names, branch lengths, data by name."""
 
+from ._schedule import schedule as schedule
 from ._sweep import TreeProblem as TreeProblem
 from ._tree import Tree as Tree

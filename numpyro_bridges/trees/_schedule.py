@@ -12,10 +12,7 @@ import numpy as np
 
 
 class Schedule(NamedTuple):
-    """Static numbers. *Ends* are branches that lead to what nothing further hangs on, *inner* ones the others.
-
-    An end is a tip, or a node that is seen exactly and in full, where the tree may be cut.
-    """
+    """Static numbers. *Ends* are nodes on which nothing that is seen hangs any more, *inner* ones the others."""
 
     ends: tuple[int, ...]
     """Nodes at the ends, in preorder."""
@@ -32,8 +29,8 @@ class Schedule(NamedTuple):
     """For each node of `inner` whether it is the first to reach its parent on the way up."""
 
 
-def schedule(parents: Sequence[int], observed: Sequence[int], cuts: Sequence[int] = ()) -> Schedule:
-    """The schedule of a tree in preorder; below a node of `cuts` its children start anew."""
+def schedule(parents: Sequence[int], observed: Sequence[int]) -> Schedule:
+    """The schedule of a tree in preorder."""
     count, above = len(parents), np.array(parents)
     needed = np.zeros(count, bool)
     needed[list(observed)] = True
@@ -43,20 +40,16 @@ def schedule(parents: Sequence[int], observed: Sequence[int], cuts: Sequence[int
         size[above[node]] += size[node]
     active = np.array([node for node in range(1, count) if needed[node]], int)
     has_child = np.isin(np.arange(count), above[active])
-    is_end = np.array([not has_child[node] or node in cuts for node in range(count)])
-    ends = active[is_end[active]]
+    ends = active[~has_child[active]]
     children: dict[int, list[int]] = {node: [] for node in range(count)}
-    for node in active:
-        # what hangs on a cut starts from a known state, as if from the root
-        start = 0 if above[node] in cuts else int(above[node])
-        if not is_end[node]:
-            children[start].append(int(node))
+    for node in active[has_child[active]]:
+        children[int(above[node])].append(int(node))
     order = _heavy_last(children, size)
     slot_of, taken, free = {0: 0}, 1, []
     first, remaining = {}, {node: len(own) for node, own in children.items()}
     slots, parent_slots = [], []
     for node in order:
-        parent = 0 if above[node] in cuts else int(above[node])
+        parent = int(above[node])
         parent_slots.append(slot_of[parent])
         first[node] = remaining[parent] == 1  # the last on the way down
         remaining[parent] -= 1

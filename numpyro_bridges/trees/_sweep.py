@@ -18,6 +18,7 @@ root.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -49,9 +50,6 @@ class Information(NamedTuple):
 
     def __add__(self, other):  # type: ignore[override]
         return Information(*(a + b for a, b in zip(self, other, strict=True)))
-
-    def log_value(self, y: State) -> Float[Array, ""]:
-        return self.c + jnp.sum(self.F * y) - 0.5 * jnp.sum(y * (self.H @ y))
 
     def as_observation(self) -> tuple[Observation, State, Float[Array, ""]]:
         """The same as an observation w = R y + N(0, I), and the log density that it has too much."""
@@ -87,7 +85,17 @@ class UpwardPass(NamedTuple):
     """Of the branches to inner nodes, in the order of the schedule."""
     observations: Observation
     data: State
+    ends: "Led"
     at_root: Information
+
+
+class Led(NamedTuple):
+    """How the branches to the ends are led, along a leading axis."""
+
+    plan: AbstractPlan
+    seen: Observation
+    observed: State
+    ts: Array
 
 
 class TreeProblem(eqx.Module):
@@ -106,7 +114,7 @@ class TreeProblem(eqx.Module):
 
     @classmethod
     def of(cls, sde, guide, x0, tree: Tree, conditions: AbstractCondition, num_steps: int, t0) -> "TreeProblem":
-        """With anchors where a Brownian motion would be, given the data."""
+        """With every anchor at the root: for linear processes, for simulation, and before `anchored`."""
         guide = default_guide(sde, x0) if guide is None else guide
         walk = schedule(tree.parents, tree.observed)
         above = np.array(tree.parents[1:])
@@ -114,21 +122,24 @@ class TreeProblem(eqx.Module):
         if not sde.is_autonomous(x0):
             clock = t0 + tree.depths[above]
 
-        def made(sde, guide, anchors, num_steps):
-            branches = Branch(tree.lengths, clock, anchors[1:], anchors[above])
-            return cls(sde, guide, x0, branches, conditions, tree.parents, tree.observed, num_steps, walk)
+        at_root = jnp.broadcast_to(x0, (tree.num_nodes - 1, *x0.shape))
+        branches = Branch(tree.lengths, clock, at_root, at_root)
+        return cls(sde, guide, x0, branches, conditions, tree.parents, tree.observed, num_steps, walk)
 
-        anchors = jnp.broadcast_to(x0, (tree.num_nodes, *x0.shape))
-        if sde.has_exact_transition:  # linear everywhere
-            return made(sde, guide, anchors, num_steps)
-        a = sde.covariance(t0, x0)
+    def anchored(self, t0) -> "TreeProblem":
+        """With anchors where a Brownian motion would be, given the data; a linear process needs none."""
+        if self.sde.has_exact_transition:
+            return self
+        a = self.sde.covariance(t0, self.x0)
         variance = jnp.mean(jnp.diagonal(a)) if a.ndim == 2 else jnp.mean(a)
         walker = BrownianMotion(jnp.where(variance > 0, variance, 1.0))
-        rough = made(walker, FrozenGuide(), anchors, 1)
-        still = jnp.zeros((len(walk.active), *x0.shape), x0.dtype)
+        rough = replace(self, sde=walker, guide=FrozenGuide(), num_steps=1)
+        active = np.array(self.schedule.active)
+        still = jnp.zeros((len(active), *self.x0.shape), self.x0.dtype)
         paths, _ = rough.down(rough.up(), still)
-        anchors = anchors.at[np.array(walk.active)].set(paths[:, -1])
-        return made(sde, guide, anchors, num_steps)
+        anchors = jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape)).at[active].set(paths[:, -1])
+        above = np.array(self.parents[1:])
+        return replace(self, branches=self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above]))
 
     @property
     def is_exact(self) -> bool:
@@ -157,8 +168,8 @@ class TreeProblem(eqx.Module):
             ts = self._grid(branch.length, False)
             return retrace(self._edge(branch), plan, seen, ts, path - branch.anchor, w, key)
 
-        def end(condition, branch, path, key):
-            plan, seen, observed, ts = self._plan_of_end(condition, branch)
+        def end(led, branch, path, key):
+            plan, seen, observed, ts = led
             y = path - branch.anchor
             observed = apply(seen.operator, y[-1]) if seen.exact else observed
             return retrace(self._edge(branch), plan, seen, ts, y, observed, key)
@@ -166,7 +177,7 @@ class TreeProblem(eqx.Module):
         keys = jr.split(key, len(walk.active))
         at_inner, at_ends = ([place[node] for node in nodes] for nodes in (walk.inner, walk.ends))
         own, others = (_picked((paths, keys), rows) for rows in (at_inner, at_ends))
-        z = jax.vmap(end)(self._rows(walk.ends), self._of(walk.ends), *others)
+        z = jax.vmap(end)(up.ends, self._of(walk.ends), *others)
         noise = jnp.zeros((len(walk.active), *z.shape[1:]), z.dtype).at[np.array(at_ends)].set(z)
         if at_inner:
             branches = self._of(walk.inner)
@@ -234,23 +245,22 @@ class TreeProblem(eqx.Module):
         extra = jnp.zeros((0,), self.x0.dtype)
         return seen, displaced.target(self.x0, jnp.ones((), self.x0.dtype), extra).value
 
-    def _plan_of_end(self, condition, branch: Branch) -> tuple[AbstractPlan, Observation, State, Array]:
+    def _led(self, condition, branch: Branch) -> Led:
         seen, observed = self._seen(condition, branch)
         ts = self._grid(branch.length, condition.exact)
         plan = self.guide.plan(self._edge(branch), seen, jnp.zeros_like(self.x0), ts)
-        return plan, seen, observed, ts
+        return Led(plan, seen, observed, ts)
 
-    def _message_of_end(self, condition, branch: Branch) -> Information:
-        plan, seen, observed, _ = self._plan_of_end(condition, branch)
-        message = self._start_message(plan, branch, observed)
-        return message._replace(c=message.c + seen.log_scale)
+    def _message_of_end(self, led: Led, branch: Branch) -> Information:
+        message = self._start_message(led.plan, branch, led.observed)
+        return message._replace(c=message.c + led.seen.log_scale)
 
-    def _own_messages(self) -> Information:
+    def _own_messages(self, ends: Led) -> Information:
         """For each node of the tree what is seen at it and at the ends that hang on it."""
         schedule, count = self.schedule, len(self.parents)
         nodes = schedule.ends
         above = np.array(self.parents)[list(nodes)]
-        messages = jax.vmap(self._message_of_end)(self._rows(nodes), self._of(nodes))
+        messages = jax.vmap(self._message_of_end)(ends, self._of(nodes))
         blank = nothing(self.x0)
         totals = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), blank)
         totals = jax.tree.map(lambda a, b: a.at[above].add(b), totals, messages)
@@ -271,7 +281,8 @@ class TreeProblem(eqx.Module):
     def up(self) -> UpwardPass:
         """Messages, from the ends to the root."""
         schedule = self.schedule
-        own = self._own_messages()
+        ends = jax.vmap(self._led)(self._rows(schedule.ends), self._of(schedule.ends))
+        own = self._own_messages(ends)
         blank = nothing(self.x0)
         kept = jax.tree.map(lambda a: jnp.zeros((schedule.num_slots + 1, *a.shape), a.dtype), blank)
         kept = varying_like(kept, self.sde, self.branches, own)
@@ -301,11 +312,11 @@ class TreeProblem(eqx.Module):
         kept, (plans, observations, data) = jax.lax.scan(step, kept, inputs)
         plans, observations, data = jax.tree.map(lambda a: jnp.flip(a, 0), (plans, observations, data))
         at_root = jax.tree.map(lambda a, b: a[0] + b[0], own, kept)
-        return UpwardPass(plans, observations, data, at_root)
+        return UpwardPass(plans, observations, data, ends, at_root)
 
     def log_evidence(self, up: UpwardPass) -> Float[Array, ""]:
         """The message at the root: the log likelihood itself where the process is linear."""
-        return up.at_root.log_value(self.x0 - self.x0)
+        return up.at_root.c  # the root's anchor is x0
 
     def down(self, up: UpwardPass, noise: Float[Array, "steps k *dim"]):
         """States of every active node's branch `(active, K + 1, n, dim)`, and Ψ."""
@@ -335,15 +346,15 @@ class TreeProblem(eqx.Module):
         number = {0: 0} | {node: i + 1 for i, node in enumerate(inner)}
         starts = known[np.array([number[self.parents[node]] for node in ends])]
 
-        def end(condition, branch, x, z):
-            plan, seen, observed, ts = self._plan_of_end(condition, branch)
+        def end(led, branch, x, z):
+            plan, seen, observed, ts = led
             sde, y = self._edge(branch), x - branch.anchor
             path, y, log_weight = travel(sde, plan, ts, y, z[:-1], observed)
             last, log_density = arrive(sde, seen, ts, y, z[-1], observed)
             path = branch.anchor[None] + jnp.concatenate([path, last[None]])
             return jnp.concatenate([x[None], path]), log_weight + log_density
 
-        end_paths, end_weights = jax.vmap(end)(self._rows(ends), self._of(ends), starts, noise[at_ends])
+        end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
         paths = jnp.zeros((len(schedule.active), K + 1, *self.x0.shape), self.x0.dtype)
         paths = paths.at[at_ends].set(end_paths).at[at_inner].set(inner_paths)
         log_weight = jnp.sum(inner_weights) + jnp.sum(end_weights)

@@ -152,11 +152,7 @@ class Tree(eqx.Module):
     @classmethod
     def chain(cls, times: ArrayLike, names: Sequence[str | None] | None = None) -> "Tree":
         """A time series: nodes one after the other, at `times` `(m,)` since the root, all of them seen."""
-        times = as_float(times, "times")
-        require(
-            times.ndim == 1 and times.size > 0,
-            f"`times` must be a vector of times since the root; got shape {times.shape}.",
-        )
+        times = _as_vector(times, "times")
         value = concrete(times)
         require(
             value is None or bool(np.all(np.diff(value, prepend=0.0) >= 0)),
@@ -170,11 +166,7 @@ class Tree(eqx.Module):
     @classmethod
     def star(cls, lengths: ArrayLike, names: Sequence[str | None] | None = None) -> "Tree":
         """Tips that share the root and nothing else, at `lengths` `(m,)` from it."""
-        lengths = as_float(lengths, "lengths")
-        require(
-            lengths.ndim == 1 and lengths.size > 0,
-            f"`lengths` must be a vector, one for each tip; got shape {lengths.shape}.",
-        )
+        lengths = _as_vector(lengths, "lengths")
         own = None if names is None else [None, *_as_names(names, lengths.size)]
         return cls([-1] + [0] * lengths.size, lengths, own)
 
@@ -337,6 +329,15 @@ class Tree(eqx.Module):
             f"{odd[0] if odd else ''!r} has {np.shape(rows[odd[0]]) if odd else ''}.",
         )
         return np.stack(values)
+
+
+def _as_vector(values: ArrayLike, name: str) -> Array:
+    array = as_float(values, name)
+    require(
+        array.ndim == 1 and array.size > 0,
+        f"`{name}` must be a vector, one number for each node but the root; got shape {array.shape}.",
+    )
+    return array
 
 
 def _as_parents(parents: Sequence[int]) -> tuple[int, ...]:
