@@ -79,6 +79,25 @@ def test_laplace(potential, start):
     assert np.all((ratios > 1 / 1.5) & (ratios < 1.5)), ratios
 
 
+def test_laplace_in_single_precision():
+    """Rounding near the mode does not get into the inverse Hessian: SDs to a factor of 2, wherever the search starts."""
+    data = (2000 + np.random.default_rng(1).normal(size=(200, 20))).astype(np.float32)
+
+    def potential(x):
+        z = (data.astype(x.dtype) - x[0]) * jnp.exp(-x[1])
+        return jnp.sum(0.5 * z * z) + data.size * x[1]
+
+    with jax.enable_x64(False):
+        starts = np.random.default_rng(0).normal([2000.0, 0.5], 0.3, (20, 2)).astype(np.float32)
+        found = jax.jit(jax.vmap(lambda x: laplace(potential, x)))(starts)
+    mode = scipy.optimize.minimize(potential, np.array([2000.0, 0.0]), jac=jax.grad(potential), method="BFGS").x
+    covariance = np.linalg.inv(jax.hessian(potential)(mode))
+    for mean, scale in zip(np.asarray(found.mean, float), np.asarray(found.scale, float), strict=True):
+        assert np.all(np.abs(mean - mode) < 0.5 * np.sqrt(np.diag(covariance)))
+        ratios = scipy.linalg.eigvalsh(scale @ scale.T, covariance)
+        assert np.all((ratios > 1 / 4) & (ratios < 4)), ratios
+
+
 def test_laplace_without_a_start():
     found = jax.jit(lambda x: laplace(bent, x))(jnp.array([2.0, 0.0, 1.0]))
     assert np.array_equal(found.mean, [2.0, 0.0, 1.0]) and np.array_equal(found.scale, np.eye(3))

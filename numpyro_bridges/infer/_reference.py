@@ -49,6 +49,8 @@ def laplace(potential, theta: Array) -> Reference:
 
 _MAX_EVALUATIONS = 100
 _GRADIENT_TOLERANCE = 1e-5
+_ROUNDING = 100.0
+"""Rounding of a potential, a sum of many terms, relative to its value, in units of the precision."""
 
 
 class _Search(NamedTuple):
@@ -69,8 +71,14 @@ def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
     them is most of what the start of a chain takes.
     """
 
+    rounding = _ROUNDING * jnp.finfo(x.dtype).eps
+
     def go_on(search: _Search):
-        moves = jnp.max(jnp.abs(search.slope)) > _GRADIENT_TOLERANCE
+        # a step that promises less than rounding would fill the inverse Hessian with noise
+        promised = -search.slope @ search.step
+        moves = (jnp.max(jnp.abs(search.slope)) > _GRADIENT_TOLERANCE) & (
+            promised > rounding * (1 + jnp.abs(search.value))
+        )
         return (moves | (search.num_evaluations == 0)) & (search.num_evaluations < _MAX_EVALUATIONS)
 
     def body(search: _Search):
