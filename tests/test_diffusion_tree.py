@@ -210,7 +210,8 @@ def sine(p):
 
 
 SMALL = nb.Tree.from_newick("((a:.5,b:.7):.4,c:.6);")
-LARGE = nb.Tree.from_newick("(((a:.3,b:.4)x:.2,c:0):.3,(d:.2,(e:.1,f:.3):.2):.1);")
+TEXT_LARGE = "(((a:.3,b:.4)x:.2,c:0):.3,(d:.2,(e:.1,f:.3):.2):.1);"
+LARGE = nb.Tree.from_newick(TEXT_LARGE)
 
 
 @pytest.mark.parametrize("num_steps", [4, 10])
@@ -348,15 +349,16 @@ def test_priors_on_everything_in_both_precisions():
     """Kernel, errors of each tip, lengths, root and guide, inside a model under jit: float32 within 0.02 of float64."""
     angles = 2 * np.pi * np.arange(6) / 6
     circle = np.stack([np.cos(angles), np.sin(angles)], 1)
-    tree = LARGE.observing(list("abcdef") + ["x"])
+    size = LARGE.num_nodes - 1
     data = np.stack([(1 + 0.05 * i) * circle + 0.02 * i for i in range(7)])
-    space = nb.Landmarks(6, 2)
 
     def everything(data):
+        tree = nb.Tree.from_newick(TEXT_LARGE).observing(list("abcdef") + ["x"])
+        space = nb.Landmarks(6, 2)
         amplitude = numpyro.sample("amplitude", dist.LogNormal(-1.0, 0.3))
         length_scale = numpyro.sample("length_scale", dist.LogNormal(-0.3, 0.3))
         sd = numpyro.sample("sd", dist.LogNormal(-3.0, 0.3).expand([7]).to_event(1))
-        rates = numpyro.sample("rates", dist.LogNormal(0.0, 0.3).expand([tree.num_nodes - 1]).to_event(1))
+        rates = numpyro.sample("rates", dist.LogNormal(0.0, 0.3).expand([size]).to_event(1))
         start = numpyro.sample("start", dist.Normal(circle, 0.1).to_event(2))
         guide = nb.RecedingGuide(numpyro.sample("end_weight", dist.Uniform(0.0, 0.5)))
         flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale), noise=nb.LandmarkNoise(1e-5))
@@ -367,9 +369,8 @@ def test_priors_on_everything_in_both_precisions():
         nb.sample("tips", tree_law, obs=data)
 
     values = {"amplitude": 0.4, "length_scale": 0.7, "sd": np.full(7, 0.05), "start": circle, "end_weight": 0.1}
-    values |= {"rates": np.linspace(0.8, 1.2, tree.num_nodes - 1)}
-    walk = schedule(tree.parents, tree.observed)
-    values |= {"tips_noise": np.random.default_rng(0).normal(size=(4 * len(walk.active), 6, 2))}
+    values |= {"rates": np.linspace(0.8, 1.2, size)}
+    values |= {"tips_noise": np.random.default_rng(0).normal(size=(4 * size, 6, 2))}
 
     def value_and_gradient(dtype):
         sites = {name: jnp.asarray(value, dtype) for name, value in values.items()}
@@ -381,9 +382,9 @@ def test_priors_on_everything_in_both_precisions():
         single, single_slopes = value_and_gradient(np.float32)
     assert single.dtype == np.float32 and abs(single - double) < 0.02
     for name in values:
-        size = np.max(np.abs(slopes[name]))
-        assert size > 0
-        np.testing.assert_allclose(single_slopes[name], slopes[name], rtol=0, atol=2e-3 * size, err_msg=name)
+        largest = np.max(np.abs(slopes[name]))
+        assert largest > 0
+        np.testing.assert_allclose(single_slopes[name], slopes[name], rtol=0, atol=2e-3 * largest, err_msg=name)
 
 
 WRONG = {

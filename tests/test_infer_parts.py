@@ -80,7 +80,7 @@ def test_laplace(potential, start):
 
 
 def test_laplace_in_single_precision():
-    """Rounding near the mode does not get into the inverse Hessian: SDs to a factor of 2, wherever the search starts."""
+    """Rounding near the mode does not get into the inverse Hessian, from any start: SDs to a factor of 2."""
     data = (2000 + np.random.default_rng(1).normal(size=(200, 20))).astype(np.float32)
 
     def potential(x):
