@@ -1,13 +1,14 @@
 """How good is a guide? Spread of the log weight, evidence and time, for each guide on simulated, real and small cases.
 
-    python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing cell gbm]
+    python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing butterflies cell gbm]
 
 One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard error, ESS in percent, k̂
 and whether the evidence is to be trusted, seconds of a run without compilation, and seconds per effective particle. A
 standard error is infinite where it is not; `spread` is that of the weights drawn alone, sd(w)/(mean(w) √S).
 `reference` is a log evidence from elsewhere: a closed form, or a long run. All in double precision.
 
-The simulated Kunita cases are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or `../shared/data`.
+The simulated Kunita cases and the butterflies are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or
+`../shared/data`.
 """
 
 import argparse
@@ -29,7 +30,10 @@ import numpyro_bridges as nb
 GUIDES = {
     "FrozenGuide()": (nb.FrozenGuide(), None),
     "RecedingGuide()": (nb.RecedingGuide(), None),
-    "RecedingGuide(0.2)": (nb.RecedingGuide(0.2), None),
+    "RecedingGuide(0.1)": (nb.RecedingGuide(0.1), None),
+    "GeodesicGuide()": (nb.GeodesicGuide(), None),
+    "GeodesicGuide(end_weight=0)": (nb.GeodesicGuide(end_weight=0.0), None),
+    "GeodesicGuide(end_weight=0.2)": (nb.GeodesicGuide(end_weight=0.2), None),
     "DriftGuide(RecedingGuide())": (nb.DriftGuide(nb.RecedingGuide()), None),
     "FrozenGuide(), continuous Euler weight": (nb.FrozenGuide(), diffrax.Euler()),
 }
@@ -41,12 +45,20 @@ CONSTANT = {
 }
 
 
+FOLDER = Path(os.environ.get("NUMPYRO_BRIDGES_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def found(case: str, file: Path) -> bool:
+    """Whether a file is there; says what to do where it is not."""
+    if not file.is_file():
+        print(json.dumps({"case": case, "skipped": f"no {file}: set NUMPYRO_BRIDGES_DATA"}))
+    return file.is_file()
+
+
 def kunita():
     """Three simulated end states of a strongly nonlinear flow: 16 landmarks, observation SD 0.032."""
-    folder = Path(os.environ.get("NUMPYRO_BRIDGES_DATA", Path(__file__).parents[2] / "shared" / "data"))
-    file = folder / "kunita_cases" / "kunita_cases.npz"
-    if not file.is_file():
-        print(json.dumps({"case": "kunita", "skipped": f"no {file}: set NUMPYRO_BRIDGES_DATA"}))
+    file = FOLDER / "kunita_cases" / "kunita_cases.npz"
+    if not found("kunita", file):
         return
     data = np.load(file)
     space = nb.Landmarks(16, 2, weights=1.0)
@@ -65,6 +77,24 @@ def wing():
     match = nb.InexactMatch.from_point_sd(0.005, space)
     setting = {"x0": wings.points[0], "t1": 1.0, "num_steps": 50}
     yield "wing", flow, match.at(wings.points[1]), setting, None, GUIDES
+
+
+def butterflies():
+    """From the outline of one species to another's, 64 points, at two amplitudes."""
+    shapes = []
+    for species in ("honrathi", "polytes"):
+        file = FOLDER / "papilio" / f"outline_{species}_anchored.csv"
+        if not found("butterflies", file):
+            return
+        outline = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(3, 4))
+        shapes.append(outline[np.round(np.arange(64) * len(outline) / 64).astype(int)])
+    x0, v = nb.procrustes_align(np.stack(shapes), closed=True)[0]
+    space = nb.Landmarks(64, 2)
+    match = nb.InexactMatch(0.02**2 / 32)
+    setting = {"x0": x0, "t1": 1.0, "num_steps": 40}
+    for amplitude in (0.1, 0.2):
+        flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, 0.3))
+        yield f"butterflies {amplitude}", flow, match.at(v), setting, None, GUIDES
 
 
 def cell():
@@ -89,7 +119,7 @@ def gbm():
     yield "gbm", sde, nb.ExactMatch().at([1.5]), setting, -0.872436, GUIDES
 
 
-CASES = {"kunita": kunita, "wing": wing, "cell": cell, "gbm": gbm}
+CASES = {"kunita": kunita, "wing": wing, "butterflies": butterflies, "cell": cell, "gbm": gbm}
 
 
 def measure(bridge, num_particles: int) -> dict:

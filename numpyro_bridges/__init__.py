@@ -22,6 +22,7 @@ from .guiding import (
     AbstractGuide as AbstractGuide,
     DriftGuide as DriftGuide,
     FrozenGuide as FrozenGuide,
+    GeodesicGuide as GeodesicGuide,
     GuidedStep as GuidedStep,
     RecedingGuide as RecedingGuide,
     ScoreGuide as ScoreGuide,

@@ -8,6 +8,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -24,6 +25,7 @@ from .guiding import (
     exact_message,
     levy_area,
     retrace,
+    retrace_arrival,
     travel,
     travel_continuous,
 )
@@ -380,7 +382,7 @@ class GuidedBridge(eqx.Module):
             auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
             path, log_weight = travel_continuous(frame.sde, auxiliary, self.solver, seen, ts, frame.start, noise, v)
         else:
-            path, y, log_weight = travel(frame.sde, plan, ts, frame.start, noise[:-1], v)
+            path, y, log_weight = travel(frame.sde, plan, ts[:-1], frame.start, noise[:-1], v)
             end, log_density = arrive(frame.sde, seen, ts, y, noise[-1], v)
             path, log_weight = jnp.concatenate([path, end[None]]), log_weight + log_density
         path = frame.origins[1:] + path
@@ -434,7 +436,10 @@ class GuidedBridge(eqx.Module):
         assert plan is not None
         y = (path - frame.origins).at[0].set(frame.start)
         observed = apply(seen.operator, y[-1]) if seen.exact else self._target(problem, plan, jnp.zeros((0,))).value
-        z = retrace(frame.sde, plan, seen, ts, y, observed, key)
+        key_path, key_end = (None, None) if key is None else jr.split(key)
+        z = retrace(frame.sde, plan, ts[:-1], y[:-1], observed, key_path)
+        last = retrace_arrival(frame.sde, seen, ts, y[-2], y[-1], observed, key_end)
+        z = jnp.concatenate([z, last[None]])
         if condition.num_extra_noises:
             message = self._start(problem, plan)
             mean = apply(message.operator, frame.start) + message.shift

@@ -3,6 +3,7 @@ from ._base import (
     AbstractMatch as AbstractMatch,
     Observation as Observation,
     Target as Target,
+    lift as lift,
 )
 from ._cylinder import CylinderSet as CylinderSet, IntervalCensored as IntervalCensored
 from ._match import ExactMatch as ExactMatch, InexactMatch as InexactMatch

@@ -5,7 +5,13 @@ from ._continuous import (
     travel_continuous as travel_continuous,
     weight_rate as weight_rate,
 )
-from ._edge import arrive as arrive, follow as follow, retrace as retrace, travel as travel
+from ._edge import (
+    arrive as arrive,
+    retrace as retrace,
+    retrace_arrival as retrace_arrival,
+    travel as travel,
+)
+from ._geodesic import GeodesicGuide as GeodesicGuide, default_guide as default_guide
 from ._guides import (
     AbstractGuide as AbstractGuide,
     AbstractPlan as AbstractPlan,
@@ -13,7 +19,6 @@ from ._guides import (
     FrozenGuide as FrozenGuide,
     RecedingGuide as RecedingGuide,
     backward_filter as backward_filter,
-    default_guide as default_guide,
 )
 from ._score import (
     LearnedSteering as LearnedSteering,

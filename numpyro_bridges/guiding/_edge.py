@@ -1,7 +1,8 @@
 """One edge: a path from a state to what is seen of its end, its log weight, and the way back from a path to its noise.
 
-A bridge is one edge. `travel` takes every step but the last, led by a plan; `arrive` takes the last one, onto the
-observation itself, exactly whatever guides; `retrace` recovers the noise.
+`travel` takes steps led by a plan: all to an inner node of a tree, all but the last to what is seen;
+`arrive` takes that one, onto the observation itself, exactly whatever guides. `retrace` and `retrace_arrival` recover
+the noise.
 """
 
 import functools
@@ -28,10 +29,13 @@ def travel(
     plan: AbstractPlan,
     ts: Float[Array, " K+1"],
     x0: State,
-    noise: Float[Array, "K-1 k *dim"],
+    noise: Float[Array, "K k *dim"],
     observed: State,
-) -> tuple[Float[Array, "K-1 n *dim"], State, Float[Array, ""]]:
-    """The states after x0 but for the last, the last but one by itself, and the log weight so far."""
+) -> tuple[Float[Array, "K n *dim"], State, Float[Array, ""]]:
+    """The states after x0, the last by itself, and the log weight of the steps between the times.
+
+    The plan has an entry for each of the times.
+    """
     few = x0.shape[0] <= _MAX_KEPT
 
     @functools.partial(
@@ -46,7 +50,7 @@ def travel(
 
     start = (x0, jnp.zeros((), x0.dtype))
     start = varying_like(start, sde, plan, ts, noise, observed)
-    (x, log_weight), path = jax.lax.scan(step, start, (ts[:-2], ts[1:-1], noise, _ends(plan)))
+    (x, log_weight), path = jax.lax.scan(step, start, (ts[:-1], ts[1:], noise, _ends(plan)))
     return path, x, log_weight
 
 
@@ -59,52 +63,48 @@ def arrive(
     return x, steering.log_evidence() + seen.log_scale
 
 
-def follow(
-    sde: AbstractSDE,
-    plan: AbstractPlan,
-    seen: Observation,
-    ts: Float[Array, " K+1"],
-    x0: State,
-    noise: Float[Array, "K k *dim"],
-    observed: State,
-) -> tuple[Float[Array, "K n *dim"], Float[Array, ""]]:
-    """The states after x0, every step being guided, the last by `seen` itself, and the log weight Σ log p/q."""
-    path, x, log_weight = travel(sde, plan, ts, x0, noise[:-1], observed)
-    transition, steering = _last_step(sde, seen, ts, x, observed)
-    u, step_weight = steering.drive(noise[-1])
-    x = transition.mean + apply(transition.factor, u)
-    return jnp.concatenate([path, x[None]]), log_weight + step_weight
-
-
 def retrace(
     sde: AbstractSDE,
     plan: AbstractPlan,
-    seen: Observation,
     ts: Float[Array, " K+1"],
     path: Float[Array, "K+1 n *dim"],
     observed: State,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "K k *dim"]:
-    """The noise of a path; what the path leaves free of it is drawn with `key`, 0 without one."""
-    free = jnp.zeros((ts.shape[0], sde.noise_size(path[0]), *path.shape[2:]), path.dtype)
-    if key is not None:
-        free = jr.normal(key, free.shape, path.dtype)
+    """The noise by which `travel` takes a path; what the path leaves free of it is drawn with `key`, 0 without one."""
 
     def step(x, x_next, t0, t1, planned, free):
         transition = sde.transition(t0, t1, x)
         steering = plan.steer(planned, transition, t1 - t0, x, observed)
         return steering.inverse(_driving_noise(transition, x_next, free))
 
-    z = jax.vmap(step)(path[:-2], path[1:-1], ts[:-2], ts[1:-1], _ends(plan), free[:-2])
-    transition, steering = _last_step(sde, seen, ts, path[-2], observed)
-    last = steering.inverse(_driving_noise(transition, path[-1], free[-2]))
-    if seen.exact:
-        last = last + steering.without_effect(free[-1])
-    return jnp.concatenate([z, last[None]])
+    free = _free_noise(sde, path[:-1], key)
+    return jax.vmap(step)(path[:-1], path[1:], ts[:-1], ts[1:], _ends(plan), free)
+
+
+def retrace_arrival(
+    sde: AbstractSDE,
+    seen: Observation,
+    ts: Float[Array, " K+1"],
+    x: State,
+    end: State,
+    observed: State,
+    key: PRNGKeyArray | None,
+) -> Noise:
+    """The noise by which `arrive` takes the last step, from x to the end."""
+    free, without_effect = _free_noise(sde, jnp.stack([x, x]), key)
+    transition, steering = _last_step(sde, seen, ts, x, observed)
+    z = steering.inverse(_driving_noise(transition, end, free))
+    return z + steering.without_effect(without_effect) if seen.exact else z
+
+
+def _free_noise(sde, states, key):
+    shape = (states.shape[0], sde.noise_size(states[0]), *states.shape[2:])
+    return jnp.zeros(shape, states.dtype) if key is None else jr.normal(key, shape, states.dtype)
 
 
 def _ends(plan: AbstractPlan):
-    """The plan's entries at the end of every step but the last."""
+    """The plan's entries at the ends of steps."""
     return jax.tree.map(lambda a: a[1:], plan.steps)
 
 

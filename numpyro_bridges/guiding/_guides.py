@@ -68,6 +68,13 @@ class AbstractGuide(eqx.Module):
         """
         return False
 
+    def follows(self, sde: Displaced, seen: Observation, reference: State) -> bool:
+        """Whether its covariances follow the state, that of what comes after the end too.
+
+        `plan` then takes `beyond`, the time after the end until the state is seen: the process goes on from there.
+        """
+        return False
+
     def check(self, sde: AbstractSDE, x: State) -> None:
         """`ValueError` where the guide does not fit states shaped like x."""
         return None
@@ -142,7 +149,9 @@ class FrozenGuide(AbstractGuide):
         return LinearSDE(B, process.diffusion(t1, reference), beta)
 
 
-class _RecedingPlan(AbstractPlan):
+class RecedingPlan(AbstractPlan):
+    """Flow, shift and accumulated time, of which the forecast is made with the covariance at the current state."""
+
     steps: tuple[Structured, State, Structured]
     operator: Structured
     noise: Structured
@@ -150,7 +159,8 @@ class _RecedingPlan(AbstractPlan):
     end_weight: Structured
     exact: bool = eqx.field(static=True)
 
-    def _forecast(self, step, a: Structured):
+    def forecast(self, step, a: Structured) -> tuple[Structured, State, Structured]:
+        """Operator, shift and covariance of what is observed, where the covariance of the process is a."""
         flow, shift, kappa = step
         a = (1 - self.end_weight) * a + self.end_weight * self.end_covariance
         covariance = add(self.noise, congruence(self.operator, _accumulated(kappa, a)))
@@ -158,10 +168,10 @@ class _RecedingPlan(AbstractPlan):
 
     def steer(self, step, transition, dt, x, observed):
         a = transition.covariance / jnp.where(dt == 0, 1.0, dt)  # a branch of a tree may have no length
-        return GaussianSteering(transition, *self._forecast(step, a), observed, self.exact)
+        return GaussianSteering(transition, *self.forecast(step, a), observed, self.exact)
 
     def message(self, step, sde, t, x, observed):
-        operator, shift, covariance = self._forecast(step, sde.covariance(t, x))
+        operator, shift, covariance = self.forecast(step, sde.covariance(t, x))
         return GaussianMessage(operator, shift, semidefinite_cholesky(covariance), observed, jnp.zeros((), x.dtype))
 
 
@@ -188,7 +198,13 @@ class RecedingGuide(AbstractGuide):
     def moves(self):
         return True
 
-    def plan(self, sde, seen, reference, ts):
+    def follows(self, sde, seen, reference):
+        if sde.has_constant_covariance(reference):
+            return False
+        flow = jax.eval_shape(lambda: sde.linearised_step(jnp.zeros(()), jnp.ones(()), reference).operator)
+        return flow.ndim == 0
+
+    def plan(self, sde, seen, reference, ts, beyond=0.0):
         if sde.has_constant_covariance(reference):
             return FrozenGuide().plan(sde, seen, reference, ts)
         steps = jax.vmap(lambda s, t: sde.linearised_step(s, t, reference))(ts[:-1], ts[1:])
@@ -208,12 +224,12 @@ class RecedingGuide(AbstractGuide):
             return (flow, total, kappa), (flow, total, kappa)
 
         one = promote(jnp.ones((), reference.dtype), ndim, n)
-        start = (one, jnp.zeros_like(apply(seen.operator, reference)), jnp.zeros_like(_square(one)))
+        beyond = beyond + jnp.zeros_like(_square(one))
+        start = (one, jnp.zeros_like(apply(seen.operator, reference)), beyond)
         start = varying_like(start, seen, operator, shift, ts)
         _, planned = jax.lax.scan(back, start, (operator, shift, jnp.diff(ts)), reverse=True)
-        return _RecedingPlan(
-            planned, seen.operator, seen.covariance, sde.covariance(ts[-1], reference), self.end_weight, seen.exact
-        )
+        a = sde.covariance(ts[-1], reference)
+        return RecedingPlan(planned, seen.operator, seen.covariance, a, self.end_weight, seen.exact)
 
 
 class DriftGuide(AbstractGuide):
@@ -258,11 +274,6 @@ class _DriftPlan(AbstractPlan):
 
     def correction(self, step, x):
         return self.wrapped.correction(step, x)
-
-
-def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:
-    """`RecedingGuide()` where a depends on the state, `FrozenGuide()` where it is constant."""
-    return FrozenGuide() if sde.has_constant_covariance(x) else RecedingGuide()
 
 
 def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, State, Structured]:

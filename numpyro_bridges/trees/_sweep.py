@@ -30,10 +30,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._linalg import apply, cholesky, full_precision, solve_lower, varying_like
 from .._types import State
-from ..conditioning import AbstractCondition, GaussianMessage, Observation
-from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, arrive, default_guide, follow, retrace, travel
+from ..conditioning import AbstractCondition, GaussianMessage, Observation, lift
+from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, arrive, default_guide, retrace, retrace_arrival, travel
 from ..sdes import AbstractSDE, BrownianMotion, Displaced
 from ._schedule import Schedule, schedule
+from ._told import Told, as_seen, earlier, nothing_told, told_by
 from ._tree import Tree
 
 _LOG_2PI = 1.8378770664093453
@@ -83,10 +84,9 @@ class UpwardPass(NamedTuple):
 
     plans: AbstractPlan
     """Of the branches to inner nodes, in the order of the schedule."""
-    observations: Observation
     data: State
     ends: "Led"
-    at_root: Information
+    at_root: Information | Told
 
 
 class Led(NamedTuple):
@@ -127,8 +127,8 @@ class TreeProblem(eqx.Module):
         return cls(sde, guide, x0, branches, conditions, tree.parents, tree.observed, num_steps, walk)
 
     def anchored(self, t0) -> "TreeProblem":
-        """With anchors where a Brownian motion would be, given the data; a linear process needs none."""
-        if self.sde.has_exact_transition:
+        """With anchors where a Brownian motion would be, given the data, for processes and guides that need some."""
+        if self.sde.has_exact_transition or self.follows:
             return self
         a = self.sde.covariance(t0, self.x0)
         variance = jnp.mean(jnp.diagonal(a)) if a.ndim == 2 else jnp.mean(a)
@@ -140,6 +140,13 @@ class TreeProblem(eqx.Module):
         anchors = jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape)).at[active].set(paths[:, -1])
         above = np.array(self.parents[1:])
         return replace(self, branches=self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above]))
+
+    @property
+    def follows(self) -> bool:
+        """Whether what is seen below a node is told by a mean, for the guide's covariances to follow the state."""
+        branch = jax.tree.map(lambda a: a[0], self.branches)
+        seen, _ = self._seen(jax.tree.map(lambda a: a[0], self.conditions), branch)
+        return self.guide.follows(self._edge(branch), seen, jnp.zeros_like(self.x0))
 
     @property
     def is_exact(self) -> bool:
@@ -164,15 +171,18 @@ class TreeProblem(eqx.Module):
         up, walk = self.up(), self.schedule
         place = {node: i for i, node in enumerate(walk.active)}
 
-        def inner(branch, plan, seen, w, path, key):
+        def inner(branch, plan, w, path, key):
             ts = self._grid(branch.length, False)
-            return retrace(self._edge(branch), plan, seen, ts, path - branch.anchor, w, key)
+            return retrace(self._edge(branch), plan, ts, path - branch.anchor, w, key)
 
         def end(led, branch, path, key):
             plan, seen, observed, ts = led
-            y = path - branch.anchor
+            edge, y = self._edge(branch), path - branch.anchor
             observed = apply(seen.operator, y[-1]) if seen.exact else observed
-            return retrace(self._edge(branch), plan, seen, ts, y, observed, key)
+            key_path, key_end = jr.split(key)
+            z = retrace(edge, plan, ts[:-1], y[:-1], observed, key_path)
+            last = retrace_arrival(edge, seen, ts, y[-2], y[-1], observed, key_end)
+            return jnp.concatenate([z, last[None]])
 
         keys = jr.split(key, len(walk.active))
         at_inner, at_ends = ([place[node] for node in nodes] for nodes in (walk.inner, walk.ends))
@@ -181,7 +191,7 @@ class TreeProblem(eqx.Module):
         noise = jnp.zeros((len(walk.active), *z.shape[1:]), z.dtype).at[np.array(at_ends)].set(z)
         if at_inner:
             branches = self._of(walk.inner)
-            z = jax.vmap(inner)(branches, up.plans, up.observations, up.data, *own)
+            z = jax.vmap(inner)(branches, up.plans, up.data, *own)
             noise = noise.at[np.array(at_inner)].set(z)
         return noise.reshape(-1, *noise.shape[2:])
 
@@ -228,6 +238,11 @@ class TreeProblem(eqx.Module):
     def _edge(self, branch: Branch) -> Displaced:
         return Displaced(self.sde, branch.anchor, branch.clock)
 
+    def _inner_plan(self, branch: Branch, seen: Observation, reference: State, *beyond) -> AbstractPlan:
+        """With an entry at the end too: the last step to an inner node is led like the others."""
+        ts = self._grid(branch.length, False)
+        return self.guide.plan(self._edge(branch), seen, reference, jnp.concatenate([ts, ts[-1:]]), *beyond)
+
     def _start_message(self, plan, branch: Branch, observed: State) -> Information:
         """What the branch tells its parent, as a displacement from the parent's anchor."""
         entry = jax.tree.map(lambda a: a[0], plan.steps)
@@ -248,59 +263,93 @@ class TreeProblem(eqx.Module):
     def _led(self, condition, branch: Branch) -> Led:
         seen, observed = self._seen(condition, branch)
         ts = self._grid(branch.length, condition.exact)
-        plan = self.guide.plan(self._edge(branch), seen, jnp.zeros_like(self.x0), ts)
+        here = jnp.zeros_like(self.x0)
+        reference = lift(seen.operator, here, observed) if self.follows else here
+        plan = self.guide.plan(self._edge(branch), seen, reference, ts)
         return Led(plan, seen, observed, ts)
-
-    def _message_of_end(self, led: Led, branch: Branch) -> Information:
-        message = self._start_message(led.plan, branch, led.observed)
-        return message._replace(c=message.c + led.seen.log_scale)
-
-    def _own_messages(self, ends: Led) -> Information:
-        """For each node of the tree what is seen at it and at the ends that hang on it."""
-        schedule, count = self.schedule, len(self.parents)
-        nodes = schedule.ends
-        above = np.array(self.parents)[list(nodes)]
-        messages = jax.vmap(self._message_of_end)(ends, self._of(nodes))
-        blank = nothing(self.x0)
-        totals = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), blank)
-        totals = jax.tree.map(lambda a, b: a.at[above].add(b), totals, messages)
-        inside = [node for node in schedule.inner if node in self.observed]
-        if inside:
-
-            def one(condition, branch):
-                seen, observed = self._seen(condition, branch)
-                shift = jnp.zeros_like(observed)
-                factor = seen.factor if seen.factor is not None else jnp.zeros((), self.x0.dtype)
-                message = GaussianMessage(seen.operator, shift, factor, observed, seen.log_scale)
-                return _information(message, self.x0)
-
-            own = jax.vmap(one)(self._rows(inside), self._of(inside))
-            totals = jax.tree.map(lambda a, b: a.at[np.array(inside)].add(b), totals, own)
-        return totals
 
     def up(self) -> UpwardPass:
         """Messages, from the ends to the root."""
+        ends = jax.vmap(self._led)(self._rows(self.schedule.ends), self._of(self.schedule.ends))
+        return self._up_with_means(ends) if self.follows else self._up_with_messages(ends)
+
+    def _up_with_messages(self, ends: Led) -> UpwardPass:
+        """Each branch by the guide's own message of the one before."""
+
+        def of_end(led, branch):
+            message = self._start_message(led.plan, branch, led.observed)
+            return message._replace(c=message.c + led.seen.log_scale)
+
+        def of_node(condition, branch):
+            seen, observed = self._seen(condition, branch)
+            factor = seen.factor if seen.factor is not None else jnp.zeros((), self.x0.dtype)
+            message = GaussianMessage(seen.operator, jnp.zeros_like(observed), factor, observed, seen.log_scale)
+            return _information(message, self.x0)
+
+        def joined(total, branch):
+            seen, w, c = total.as_observation()
+            plan = self._inner_plan(branch, seen, jnp.zeros_like(self.x0))
+            message = self._start_message(plan, branch, w)
+            return message._replace(c=message.c + c), (plan, w)
+
+        own = self._own_messages(nothing(self.x0), jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
+        at_root, (plans, data) = self._summed_up(own, joined)
+        return UpwardPass(plans, data, ends, at_root)
+
+    def _up_with_means(self, ends: Led) -> UpwardPass:
+        """Each branch by the mean of what is seen below, of whatever covariance the process has there."""
+        first = jax.tree.map(lambda a: a[0], self.branches)
+        a, n = self._edge(first).covariance(jnp.zeros((), self.x0.dtype), jnp.zeros_like(self.x0)), self.x0.shape[0]
+
+        def of_end(led, branch):
+            return told_by(led.seen, led.observed, branch.length, a, n)
+
+        def of_node(condition, branch):
+            return told_by(*self._seen(condition, branch), jnp.zeros((), self.x0.dtype), a, n)
+
+        def joined(total, branch):
+            return earlier(total, branch.length, a), total
+
+        def led(total, branch):
+            seen, value, beyond, reference = as_seen(total, a, everything)
+            return self._inner_plan(branch, seen, reference, beyond), value
+
+        everything = ends.seen.operator.ndim == 1  # for each end the identity
+        messages = jax.vmap(of_end)(ends, self._of(self.schedule.ends))
+        at_root, totals = self._summed_up(self._own_messages(nothing_told(self.x0), messages, of_node), joined)
+        plans, data = jax.vmap(led)(totals, self._of(self.schedule.inner))
+        return UpwardPass(plans, data, ends, at_root)
+
+    def _own_messages(self, nothing, messages, of_node):
+        """For each node of the tree what is told by what is seen of it and by the ends that hang on it."""
+        schedule, count = self.schedule, len(self.parents)
+        above = np.array(self.parents)[list(schedule.ends)]
+        totals = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), nothing)
+        totals = jax.tree.map(lambda a, b: a.at[above].add(b), totals, messages)
+        inside = [node for node in schedule.inner if node in self.observed]
+        if inside:
+            own = jax.vmap(of_node)(self._rows(inside), self._of(inside))
+            totals = jax.tree.map(lambda a, b: a.at[np.array(inside)].add(b), totals, own)
+        return totals
+
+    def _summed_up(self, own, joined):
+        """The sum of what is told at the root, and what `joined` makes of it at inner nodes, as the schedule has them.
+
+        `joined(total, branch)` gives what the node's branch tells its parent, and what is kept of it.
+        """
         schedule = self.schedule
-        ends = jax.vmap(self._led)(self._rows(schedule.ends), self._of(schedule.ends))
-        own = self._own_messages(ends)
-        blank = nothing(self.x0)
-        kept = jax.tree.map(lambda a: jnp.zeros((schedule.num_slots + 1, *a.shape), a.dtype), blank)
+        kept = jax.tree.map(lambda a: jnp.zeros((schedule.num_slots + 1, *a.shape[1:]), a.dtype), own)
         kept = varying_like(kept, self.sde, self.branches, own)
         order = schedule.inner[::-1]
 
         def step(kept, inputs):
             own, branch, slot, parent_slot, first = inputs
             below = jax.tree.map(lambda a: jnp.where(slot < schedule.num_slots, a[slot], 0.0), kept)
-            total = own + below
-            seen, w, c = total.as_observation()
-            ts = self._grid(branch.length, False)
-            plan = self.guide.plan(self._edge(branch), seen, jnp.zeros_like(self.x0), ts)
-            message = self._start_message(plan, branch, w)
-            message = message._replace(c=message.c + c)
+            message, out = joined(own + below, branch)
             kept = jax.tree.map(
                 lambda a, b: a.at[parent_slot].set(jnp.where(first, 0.0, a[parent_slot]) + b), kept, message
             )
-            return kept, (plan, seen, w)
+            return kept, out
 
         inputs = (
             _picked(own, order),
@@ -309,10 +358,8 @@ class TreeProblem(eqx.Module):
             np.array(schedule.parent_slot[::-1], int),
             np.array(schedule.first[::-1], bool),
         )
-        kept, (plans, observations, data) = jax.lax.scan(step, kept, inputs)
-        plans, observations, data = jax.tree.map(lambda a: jnp.flip(a, 0), (plans, observations, data))
-        at_root = jax.tree.map(lambda a, b: a[0] + b[0], own, kept)
-        return UpwardPass(plans, observations, data, ends, at_root)
+        kept, out = jax.lax.scan(step, kept, inputs)
+        return jax.tree.map(lambda a, b: a[0] + b[0], own, kept), jax.tree.map(lambda a: jnp.flip(a, 0), out)
 
     def log_evidence(self, up: UpwardPass) -> Float[Array, ""]:
         """The message at the root: the log likelihood itself where the process is linear."""
@@ -330,15 +377,15 @@ class TreeProblem(eqx.Module):
         states = varying_like(states.at[0].set(self.x0), self.sde, self.branches, up, noise)
 
         def step(states, inputs):
-            branch, plan, seen, w, z, slot, parent_slot = inputs
+            branch, plan, w, z, slot, parent_slot = inputs
             x = states[parent_slot]
             ts = self._grid(branch.length, False)
-            path, log_weight = follow(self._edge(branch), plan, seen, ts, x - branch.anchor, z, w)
+            path, _, log_weight = travel(self._edge(branch), plan, ts, x - branch.anchor, z, w)
             path = jnp.concatenate([x[None], branch.anchor[None] + path])
             return states.at[slot].set(path[-1]), (path, log_weight)
 
         inputs = (
-            self._of(inner), up.plans, up.observations, up.data, noise[at_inner],
+            self._of(inner), up.plans, up.data, noise[at_inner],
             np.array(schedule.slot, int), np.array(schedule.parent_slot, int),
         )  # fmt: skip
         _, (inner_paths, inner_weights) = jax.lax.scan(step, states, inputs)
@@ -349,7 +396,7 @@ class TreeProblem(eqx.Module):
         def end(led, branch, x, z):
             plan, seen, observed, ts = led
             sde, y = self._edge(branch), x - branch.anchor
-            path, y, log_weight = travel(sde, plan, ts, y, z[:-1], observed)
+            path, y, log_weight = travel(sde, plan, ts[:-1], y, z[:-1], observed)
             last, log_density = arrive(sde, seen, ts, y, z[-1], observed)
             path = branch.anchor[None] + jnp.concatenate([path, last[None]])
             return jnp.concatenate([x[None], path]), log_weight + log_density
