@@ -399,6 +399,7 @@ def table() -> dict[str, Row]:
             guide="guide?",
             root_covariance=("array?", np.eye(len(X))),
             per_row="free",
+            per_edge="free",
             batch_shape="shape",
             batched="names?",
             validate_args="free",

@@ -376,6 +376,77 @@ def test_samples_with_a_root_that_varies():
         assert np.all(error < 0.05 * np.diag(truth).max())
 
 
+# Regimes.
+
+
+def test_rates_are_lengths():
+    """A Brownian motion of its own on each branch, value and gradient in the rates."""
+    rates = jnp.linspace(0.5, 2.0, TREE.num_nodes - 1)
+
+    def by_regime(rates):
+        sdes = jax.vmap(lambda rate: nb.BrownianMotion(rate * Q))(rates)
+        law = nb.DiffusionTree(sdes, X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",))
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
+
+    def by_length(rates):
+        law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, nb.InexactMatch(0.1), tree=TREE.scaled(rates))
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
+
+    found, slopes = jax.jit(jax.value_and_grad(by_regime))(rates)
+    expected, true_slopes = jax.jit(jax.value_and_grad(by_length))(rates)
+    np.testing.assert_allclose(found, expected, rtol=1e-10)
+    np.testing.assert_allclose(slopes, true_slopes, rtol=1e-8, atol=1e-10)
+
+
+def test_regimes_have_the_dense_normal():
+    """Ornstein–Uhlenbeck processes of two kinds, from a root that varies."""
+    kind = TREE.clade("c", "d", "e").astype(int)
+    rate, shift, scale = np.array([0.4, 1.5])[kind], np.array([0.4, -0.6])[kind], np.array([1.0, 0.3])[kind]
+    lengths, size = np.asarray(TREE.lengths), TREE.num_nodes
+    sdes = jax.vmap(lambda r, b, s: nb.LinearSDE(-r, jnp.sqrt(s) * np.linalg.cholesky(Q), b))(rate, shift, scale)
+    law = nb.DiffusionTree(
+        sdes, X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",), root_covariance=0.7 * Q
+    )
+    found = law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
+
+    decay, weight, C = np.exp(-rate * lengths), np.ones(size), 0.7 * np.eye(size)
+    push = np.zeros(size)
+    for node in range(1, size):
+        parent, e = TREE.parents[node], node - 1
+        weight[node] = decay[e] * weight[parent]
+        push[node] = decay[e] * push[parent] + shift[e] * (1 - decay[e]) / rate[e]
+        C[node, :node] = C[:node, node] = decay[e] * C[parent, :node]
+        C[node, node] = decay[e] ** 2 * C[parent, parent] + scale[e] * (1 - decay[e] ** 2) / (2 * rate[e])
+    seen = np.array(TREE.observed)
+    covariance = np.kron(C[np.ix_(seen, seen)], Q) + 0.1 * np.eye(3 * len(seen))
+    r = (DATA - weight[seen, None, None] * X0 - push[seen, None, None]).reshape(-1, 2)
+    truth = sum(stats.multivariate_normal(None, covariance).logpdf(r[:, c]) for c in (0, 1))
+    np.testing.assert_allclose(found, truth, rtol=1e-8)
+
+
+def test_regimes_of_nonlinear_processes(key):
+    """Coefficients r b and √r σ for a time t are b and σ for r t: the same weight; and the way back."""
+    rates = jnp.linspace(0.5, 2.0, TREE.num_nodes - 1)
+
+    def sde(r):
+        return nb.SDE(lambda t, x, r: r * jnp.sin(x), lambda t, x, r: jnp.sqrt(r) * (0.6 + 0.1 * jnp.cos(x[:, 0])), r)
+
+    settings = {"num_steps": 3, "root_covariance": 0.3}
+    law = nb.DiffusionTree(jax.vmap(sde)(rates), X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",), **settings)
+    scaled = nb.DiffusionTree(sde(1.0), X0, nb.InexactMatch(0.1), tree=TREE.scaled(rates), **settings)
+    z = jr.normal(key, law.noise_prior().shape())
+    np.testing.assert_allclose(law.given(z).log_prob(DATA), scaled.given(z).log_prob(DATA), rtol=1e-10)
+
+    @jax.jit
+    def there_and_back(key):
+        seen, paths = _simulated(law.parts, key)
+        problem = _problem(law.parts, seen)
+        return paths, problem.paths(problem.noise_from_paths(paths, key))
+
+    paths, again = there_and_back(key)
+    np.testing.assert_allclose(again, paths, atol=1e-10)
+
+
 # Nonlinear processes.
 
 
@@ -629,6 +700,22 @@ WRONG = {
         "and 2 rows are of nodes that have one",
     ),
     "bins": (lambda: law(match=nb.IntervalCensored([0.0])), "`match` must see a value at each node"),
+    "per_edge": (lambda: law(per_edge=("match",)), "`per_edge` may hold 'sde'"),
+    "one SDE": (
+        lambda: law(sde=nb.BrownianMotion(Q), per_edge=("sde",)),
+        "`sde` is in `per_edge`, so every array of it must have 13 rows, one for each branch",
+    ),
+    "no arrays": (
+        lambda: law(sde=nb.SDE(lambda t, x, a: -x, lambda t, x, a: 1.0), per_edge=("sde",), num_steps=2),
+        "`sde` is in `per_edge`, and has no array to have one for each branch",
+    ),
+    "spaces": (
+        lambda: law(
+            sde=jax.vmap(lambda w: nb.BrownianMotion(w, space=nb.Landmarks(3, 2, weights=w)))(jnp.arange(1.0, 14.0)),
+            per_edge=("sde",),
+        ),
+        "`sde` must have one space on all branches",
+    ),
     "per_row": (lambda: law(per_row=("sde",)), "`per_row` may hold 'match'"),
     "rows of matches": (
         lambda: law(match=jax.vmap(nb.InexactMatch)(jnp.ones(3)), per_row=("match",)),

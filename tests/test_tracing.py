@@ -290,6 +290,12 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
         | {"tree": TREE.observing(list("aab")), "per_row": ("match",)},
         lambda law: observed(law, SEVERAL),
     ),
+    "DiffusionTree, regimes": (
+        nb.DiffusionTree,
+        {"sde": Of(lambda t: jax.vmap(nb.BrownianMotion)(t * np.array([0.5, 1.0, 0.7, 0.3]))), "x0": X0}
+        | {"match": nb.InexactMatch(0.05), "tree": TREE, "per_edge": ("sde",)},
+        lambda law: observed(law, SEVERAL),
+    ),
     "DiffusionTree, batch": (
         nb.DiffusionTree,
         {"sde": PLAIN, "x0": times(BATCH), "match": nb.InexactMatch(0.05), "tree": TREE, "num_steps": 1}

@@ -17,7 +17,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import ArrayLike
 
-from .._checks import as_float, positive_integer, require, require_finite, require_instance, words
+from .._checks import as_float, concrete, positive_integer, require, require_finite, require_instance, words
 from .._types import RealScalar, State
 from ..conditioning import AbstractMatch, fused
 from ..guiding import AbstractGuide
@@ -33,6 +33,7 @@ class _Settings(eqx.Module):
 
     num_steps: int = eqx.field(static=True)
     per_row: tuple[str, ...] = eqx.field(static=True)
+    per_edge: tuple[str, ...] = eqx.field(static=True)
 
 
 class DiffusionTree(AbstractNoiseDriven):
@@ -46,7 +47,9 @@ class DiffusionTree(AbstractNoiseDriven):
 
     **Arguments:**
 
-    - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths.
+    - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths; or one for each branch with
+      `per_edge=("sde",)`, every array with an axis `(num_nodes - 1,)` in front, in the order of `tree.lengths`, as
+      `jax.vmap` of a constructor returns it. They have one space.
     - `x0`: the state at the root, `(n, dim)` or `(n,)`; with a `root_covariance` the mean of its prior.
     - `root_covariance`: C of the prior N(x0, C) of the state at the root, `()`, `(n,)` (a diagonal) or `(n, n)`, acting
       on each coordinate column; left out, the root is at x0. It is marginalised, exactly where the SDE is linear.
@@ -83,6 +86,7 @@ class DiffusionTree(AbstractNoiseDriven):
         guide: AbstractGuide | None = None,
         root_covariance: ArrayLike | None = None,
         per_row: tuple[str, ...] = (),
+        per_edge: tuple[str, ...] = (),
         batch_shape: tuple[int, ...] = (),
         batched: tuple[str, ...] | None = None,
         validate_args: bool | None = None,
@@ -102,13 +106,14 @@ class DiffusionTree(AbstractNoiseDriven):
         )
         require(any(tree.observed), "`tree` must have a seen node besides its root, which no branch leads to.")
         prior = None if root_covariance is None else as_covariance(root_covariance, "root_covariance")
-        own = names_of(per_row) or ()
+        own, own_edges = names_of(per_row) or (), names_of(per_edge) or ()
         require(set(own) <= {"match"}, f"`per_row` may hold 'match'; got {per_row}.")
+        require(set(own_edges) <= {"sde"}, f"`per_edge` may hold 'sde'; got {per_edge}.")
         require(
             num_steps is not None or sde.has_exact_transition,
             "`num_steps` must be given, for every branch: this SDE is stepped by Euler's scheme.",
         )
-        settings = _Settings(positive_integer(1 if num_steps is None else num_steps, "num_steps"), own)
+        settings = _Settings(positive_integer(1 if num_steps is None else num_steps, "num_steps"), own, own_edges)
         batch_shape = as_shape(batch_shape, "batch_shape")
         declared = names_of(batched)
         start = as_float(t0, "t0")
@@ -116,10 +121,10 @@ class DiffusionTree(AbstractNoiseDriven):
         parts = {"sde": sde, "x0": x0, "match": match, "guide": guide, "tree": tree, "t0": start, "settings": settings}
         parts["root_covariance"] = prior
         names = find_batched(parts, batch_shape, declared, _check)
-        one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
-        datum = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(one))))
+        one = _simplest(one_of(parts, names, batch_shape, (0,) * len(batch_shape)))
+        datum = jnp.zeros((len(tree.observed), *seen_shape(one)))
         _check_condition(one, datum)
-        close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1))
+        close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1), own_edges)
         branches = len(schedule(tree.parents, tree.observed).active)
         columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
         k = one["sde"].noise_size(one["x0"])
@@ -177,23 +182,26 @@ class DiffusionTree(AbstractNoiseDriven):
                 match.at(value)
 
 
-def _of_one_node(parts):
-    """The parts of the law of one node."""
-    own = parts["settings"].per_row
-    return {name: jax.tree.map(lambda a: a[0], part) if name in own else part for name, part in parts.items()}
+def _simplest(parts):
+    """The parts of the law of one node and one branch."""
+    own = parts["settings"].per_row + parts["settings"].per_edge
+    return {name: _first(part) if name in own else part for name, part in parts.items()}
+
+
+def _first(part):
+    return jax.tree.map(lambda a: a[0] if eqx.is_array(a) else a, part)
 
 
 def _check(parts):
     """Raises unless the parts make one law."""
-    rows = len(parts["tree"].observed)
-    for name in parts["settings"].per_row:
-        for leaf in jax.tree.leaves(parts[name]):
-            require(
-                leaf.ndim > 0 and leaf.shape[0] == rows,
-                f"`{name}` is in `per_row`, so every array of it must have {rows} rows, one for each row of data; got "
-                f"shape {leaf.shape}. Build it by `jax.vmap`.",
-            )
-    check_law(_of_one_node(parts))
+    tree, settings = parts["tree"], parts["settings"]
+    for name in settings.per_row:
+        _check_axis(parts[name], len(tree.observed), f"`{name}` is in `per_row`", "row of data")
+    for name in settings.per_edge:
+        _check_axis(parts[name], tree.num_nodes - 1, f"`{name}` is in `per_edge`", "branch")
+        for value in map(concrete, jax.tree.leaves(parts[name].space)):
+            require(value is None or np.all(value == value[:1]), f"`{name}` must have one space on all branches.")
+    check_law(_simplest(parts))
     prior, n = parts["root_covariance"], parts["x0"].shape[0]
     require(
         prior is None or prior.ndim == 0 or prior.shape[0] == n,
@@ -201,8 +209,19 @@ def _check(parts):
     )
 
 
+def _check_axis(part, size, why, what):
+    leaves = [leaf for leaf in jax.tree.leaves(part) if eqx.is_array(leaf)]
+    require(len(leaves) > 0, f"{why}, and has no array to have one for each {what}: leave it out.")
+    for leaf in leaves:
+        require(
+            leaf.ndim > 0 and leaf.shape[0] == size,
+            f"{why}, so every array of it must have {size} rows, one for each {what}; got shape {leaf.shape}. Build it "
+            "by `jax.vmap`.",
+        )
+
+
 def _check_condition(parts, datum):
-    tree, condition = parts["tree"], _of_one_node(parts)["match"].at(datum[0])
+    tree, condition = parts["tree"], parts["match"].at(datum[0])
     require(
         condition.num_extra_noises == 0,
         "`match` must see a value at each node, such as `InexactMatch(variance)`: branches are not led to sets.",
@@ -229,14 +248,17 @@ def _problem(parts, value) -> TreeProblem:
 
 
 def _unled(parts, value) -> TreeProblem:
-    match, sde, x0, tree = parts["match"], parts["sde"], parts["x0"], parts["tree"]
-    own, steps = "match" in parts["settings"].per_row, parts["settings"].num_steps
+    match, x0, tree, settings = parts["match"], parts["x0"], parts["tree"], parts["settings"]
+    sde, sdes = parts["sde"], None
+    if "sde" in settings.per_edge:
+        sde, sdes = _first(sde), sde
+    own = "match" in settings.per_row
     sizes = tuple(Counter(tree.observed).values())
     if max(sizes) > 1:
         conditions = fused(match, value, sizes, own, sde, x0)
     else:
         conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(match, value)
-    return TreeProblem.of(sde, parts["guide"], _root(parts), tree, conditions, steps, parts["t0"])
+    return TreeProblem.of(sde, parts["guide"], _root(parts), tree, conditions, settings.num_steps, parts["t0"], sdes)
 
 
 def _root(parts) -> Root:
@@ -260,10 +282,10 @@ def _nodes(parts, value, noise):
 def _simulated(parts, key):
     """What is seen, and the paths of the branches that lead to it."""
     key_path, key_seen = jr.split(key)
-    tree, sde, match, own = parts["tree"], parts["sde"], parts["match"], parts["settings"].per_row
-    blank = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(parts))), parts["x0"].dtype)
+    tree, match, own = parts["tree"], parts["match"], parts["settings"].per_row
+    blank = jnp.zeros((len(tree.observed), *seen_shape(_simplest(parts))), parts["x0"].dtype)
     problem = _unled(parts, blank)
-    x0 = problem.x0
+    sde, x0 = problem.sde, problem.x0
     shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])
     paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))
     ends = problem.at_nodes(paths)[np.array(tree.observed)]

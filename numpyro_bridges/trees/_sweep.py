@@ -77,6 +77,8 @@ class Branch(NamedTuple):
     anchor: State
     """A state near which coefficients are linearised: where the branch is expected to end."""
     parent_anchor: State
+    own: AbstractSDE | None = None
+    """The arrays of an SDE of its own; `None` where all branches have the same."""
 
 
 class UpwardPass(NamedTuple):
@@ -103,6 +105,7 @@ class TreeProblem(eqx.Module):
     """A tree, what is seen of it, and how its paths are led."""
 
     sde: AbstractSDE
+    """Of all branches; where they have their own, of one of them, for what they have in common."""
     guide: AbstractGuide
     root: Root
     branches: Branch
@@ -114,8 +117,11 @@ class TreeProblem(eqx.Module):
     schedule: Schedule = eqx.field(static=True)
 
     @classmethod
-    def of(cls, sde, guide, root: Root, tree: Tree, conditions: AbstractCondition, num_steps: int, t0) -> "TreeProblem":
-        """With every anchor at the root: for linear processes, for simulation, and before `anchored`."""
+    def of(cls, sde, guide, root: Root, tree: Tree, conditions, num_steps: int, t0, own) -> "TreeProblem":
+        """With every anchor at the root: for linear processes, for simulation, and before `anchored`.
+
+        `own`: the SDEs of all branches along a leading axis, `sde` being one of them, or `None`.
+        """
         x0 = root.x0
         guide = default_guide(sde, x0) if guide is None else guide
         observed = tuple(dict.fromkeys(tree.observed))
@@ -126,17 +132,17 @@ class TreeProblem(eqx.Module):
             clock = t0 + tree.depths[above]
 
         at_root = jnp.broadcast_to(x0, (tree.num_nodes - 1, *x0.shape))
-        branches = Branch(tree.lengths, clock, at_root, at_root)
+        branches = Branch(tree.lengths, clock, at_root, at_root, eqx.filter(own, eqx.is_array))
         return cls(sde, guide, root, branches, conditions, tree.parents, observed, num_steps, walk)
 
     def anchored(self, t0) -> "TreeProblem":
         """With anchors where a Brownian motion would be, given the data; a linear process needs none."""
         if self.sde.has_exact_transition:
             return self
-        a = self.sde.covariance(t0, self.x0)
-        variance = jnp.mean(jnp.diagonal(a)) if a.ndim == 2 else jnp.mean(a)
-        walker = BrownianMotion(jnp.where(variance > 0, variance, 1.0), space=self.sde.space)
-        rough = replace(self, sde=walker, guide=FrozenGuide(), num_steps=1)
+        walker, own = self._walker(None, t0), self.branches.own
+        own = None if own is None else jax.vmap(lambda own: self._walker(own, t0))(own)
+        branches = self.branches._replace(own=own)
+        rough = replace(self, sde=walker, guide=FrozenGuide(), num_steps=1, branches=branches)
         active = np.array(self.schedule.active)
         still = jnp.zeros((rough.num_noises, *self.x0.shape), self.x0.dtype)
         paths, _ = rough.down(rough.up(), still)
@@ -145,6 +151,12 @@ class TreeProblem(eqx.Module):
         above = np.array(self.parents[1:])
         branches = self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above])
         return replace(self, root=replace(self.root, anchor=anchors[0]), branches=branches)
+
+    def _walker(self, own: AbstractSDE | None, t0) -> BrownianMotion:
+        """As fast as a branch's process is at the root."""
+        a = self._sde_of(own).covariance(t0, self.x0)
+        variance = jnp.mean(jnp.diagonal(a)) if a.ndim == 2 else jnp.mean(a)
+        return BrownianMotion(jnp.where(variance > 0, variance, 1.0), space=self.sde.space)
 
     @property
     def x0(self) -> State:
@@ -259,7 +271,10 @@ class TreeProblem(eqx.Module):
         return jnp.concatenate([self.root.anchor[None], self.branches.anchor])[np.array(nodes, int)]
 
     def _edge(self, branch: Branch) -> Displaced:
-        return Displaced(self.sde, branch.anchor, branch.clock)
+        return Displaced(self._sde_of(branch.own), branch.anchor, branch.clock)
+
+    def _sde_of(self, own: AbstractSDE | None) -> AbstractSDE:
+        return self.sde if own is None else eqx.combine(own, self.sde)
 
     def _start_message(self, plan, branch: Branch, observed: State) -> Information:
         """What the branch tells its parent, as a displacement from the parent's anchor."""
