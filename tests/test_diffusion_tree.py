@@ -10,6 +10,7 @@ import pytest
 from numpyro.infer import MCMC, NUTS, Predictive
 from numpyro.infer.util import log_density
 from scipy import stats
+from scipy.linalg import block_diag
 
 import numpyro_bridges as nb
 from numpyro_bridges.distributions._tree import _problem, _simulated
@@ -54,8 +55,11 @@ def shared_times(tree):
     return jnp.asarray(shared) @ lengths
 
 
-def joint(tree, x0, data, a, noise, rate=None, shift=0.0):
-    """Log density of all rows of data by one dense normal: dX = (shift − rate X) dt + √a dW, errors of each row."""
+def joint(tree, x0, data, a, noise, rate=None, shift=0.0, root=0.0):
+    """Log density of all rows of data by one dense normal: dX = (shift − rate X) dt + √a dW, errors of each row.
+
+    `root`: the covariance of the state at the root.
+    """
     shared = shared_times(tree)
     depth = jnp.diagonal(shared)
     if rate is None:
@@ -66,7 +70,8 @@ def joint(tree, x0, data, a, noise, rate=None, shift=0.0):
         drift = shift * -jnp.expm1(-rate * depth) / rate
     mean = decay[:, None, None] * x0 + drift[:, None, None]
     m, n = data.shape[:2]
-    covariance = jnp.kron(C, a) + jnp.diag(jnp.repeat(jnp.broadcast_to(noise, (m,)), n))
+    covariance = jnp.kron(C, a) + jnp.kron(jnp.outer(decay, decay), root * jnp.ones((n, n)))
+    covariance = covariance + jnp.diag(jnp.repeat(jnp.broadcast_to(noise, (m,)), n))
     r = (data - mean).reshape(m * n, -1)
     L = jnp.linalg.cholesky(covariance)
     y = jax.scipy.linalg.solve_triangular(L, r, lower=True)
@@ -76,7 +81,7 @@ def joint(tree, x0, data, a, noise, rate=None, shift=0.0):
 def brownian(p, tree, **settings):
     match = jax.vmap(nb.InexactMatch)(p["noise"])
     return nb.DiffusionTree(
-        nb.BrownianMotion(p["a"]), p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_node=("match",), **settings
+        nb.BrownianMotion(p["a"]), p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_row=("match",), **settings
     )
 
 
@@ -84,7 +89,7 @@ def ornstein_uhlenbeck(p, tree, **settings):
     match = jax.vmap(nb.InexactMatch)(p["noise"])
     sde = nb.LinearSDE(-p["rate"], jnp.linalg.cholesky(p["a"]), p["shift"])
     return nb.DiffusionTree(
-        sde, p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_node=("match",), **settings
+        sde, p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_row=("match",), **settings
     )
 
 
@@ -193,13 +198,253 @@ def test_masks_of_their_own():
     """Landmarks that are missing in some tips say nothing: the dense normal of what is there."""
     seen = np.random.default_rng(1).random((len(SEEN), 3)) < 0.7
     match = jax.vmap(lambda mask: nb.InexactMatch(0.1, mask=mask))(jnp.asarray(seen))
-    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, match, tree=TREE, per_node=("match",))
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, match, tree=TREE, per_row=("match",))
     found = law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
     rows = seen.ravel()
     C = np.kron(shared_times(TREE), Q) + 0.1 * np.eye(rows.size)
     r = (DATA - X0).reshape(rows.size, 2)
     truth = sum(stats.multivariate_normal(None, C[rows][:, rows]).logpdf(r[rows, c]) for c in (0, 1))
     np.testing.assert_allclose(found, truth, rtol=1e-8)
+
+
+# Several specimens.
+
+TIMES = [3, 1, 4, 1, 2, 1, 1, 2]  # rows of each node of SEEN, an inner one among them
+MANY = TREE.observing([name for name, count in zip(SEEN, TIMES, strict=True) for _ in range(count)])
+ROWS = np.random.default_rng(7).normal(size=(len(MANY.observed), 3, 2))
+OWN = np.random.default_rng(8).uniform(0.02, 0.3, len(ROWS))
+THERE = np.random.default_rng(9).random((len(ROWS), 3)) < 0.6
+THERE[:3, 0] = False  # of one species nobody has seen the first landmark
+ERROR = np.array([[0.1, 0.03, 0.0], [0.03, 0.2, -0.05], [0.0, -0.05, 0.15]])
+SOME = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 0.0]])
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["errors of their own", "one error"])
+def test_several_specimens_have_the_dense_normal(own):
+    """Value to 1e-8 and gradients to 1e-6: species share their past, specimens the state of their node."""
+    p = {"a": jnp.asarray(Q), "x0": jnp.asarray(X0), "lengths": MANY.lengths}
+    p |= {"noise": jnp.asarray(OWN if own else 0.1), "rate": jnp.asarray(0.7), "shift": jnp.asarray(0.4)}
+
+    def ours(p, data):
+        sde = nb.LinearSDE(-p["rate"], jnp.linalg.cholesky(p["a"]), p["shift"])
+        match = jax.vmap(nb.InexactMatch)(p["noise"]) if own else nb.InexactMatch(p["noise"])
+        settings = {"per_row": ("match",)} if own else {}
+        law = nb.DiffusionTree(sde, p["x0"], match, tree=MANY.with_lengths(p["lengths"]), **settings)
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data)
+
+    def truth(p, data):
+        tree = MANY.with_lengths(p["lengths"])
+        return joint(tree, p["x0"], data, p["a"], p["noise"], p["rate"], p["shift"])
+
+    found, slopes = jax.jit(jax.value_and_grad(ours, (0, 1)))(p, ROWS)
+    expected, true_slopes = jax.jit(jax.value_and_grad(truth, (0, 1)))(p, ROWS)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    np.testing.assert_allclose(slopes[1], true_slopes[1], rtol=1e-6, atol=1e-6)
+    for key in p:
+        slope, true_slope = (s[key] + s[key].T if key == "a" else s[key] for s in (slopes[0], true_slopes[0]))
+        size = 1 + np.max(np.abs(true_slope))
+        np.testing.assert_allclose(slope, true_slope, rtol=1e-6, atol=1e-6 * size, err_msg=key)
+
+
+def matches(**arrays):
+    """A match for each row."""
+    return jax.vmap(lambda arrays: nb.InexactMatch(**arrays))(jax.tree.map(jnp.asarray, arrays))
+
+
+EACH = OWN[:, None, None]
+FUSED = {
+    "masks and errors": (
+        matches(variance=OWN, mask=THERE),
+        [np.eye(3)[there] for there in THERE],
+        [error * np.eye(there.sum()) for error, there in zip(OWN, THERE, strict=True)],
+    ),
+    "one mask": (nb.InexactMatch(0.1, mask=[True, False, True]), np.eye(3)[[0, 2]], 0.1 * np.eye(2)),
+    "correlated": (nb.InexactMatch(ERROR), np.eye(3), ERROR),
+    "correlated, their own": (matches(variance=EACH * ERROR), np.eye(3), EACH * ERROR),
+    "one operator": (nb.InexactMatch(0.1, SOME), SOME, 0.1 * np.eye(2)),
+    "operators": (jax.vmap(lambda s: nb.InexactMatch(s, SOME))(jnp.asarray(OWN)), SOME, EACH * np.eye(2)),
+}
+
+
+@pytest.mark.parametrize("name", FUSED)
+def test_specimens_of_every_kind(name):
+    """The dense normal of what is seen of them."""
+    match, operators, errors = FUSED[name]
+    if not isinstance(operators, list):
+        operators = [operators] * len(ROWS)
+        errors = np.broadcast_to(errors, (len(ROWS), *errors.shape[-2:]))
+    per_row = ("match",) if match.variance.shape[:1] == (len(ROWS),) else ()
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, match, tree=MANY, per_row=per_row)
+    seen = [operator @ v for operator, v in zip(operators, ROWS, strict=True)]
+    data = ROWS if "mask" in name else np.stack(seen)
+    found = law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data)
+    L = block_diag(*operators)
+    C = L @ np.kron(shared_times(MANY), Q) @ L.T + block_diag(*errors)
+    r = np.concatenate(seen) - L @ np.tile(X0, (len(ROWS), 1))
+    truth = sum(stats.multivariate_normal(None, C).logpdf(r[:, c]) for c in (0, 1))
+    np.testing.assert_allclose(found, truth, rtol=1e-8)
+
+
+def test_specimens_of_nonlinear_processes(key):
+    """The weight of the mean, of variance σ/r, for the same noise, and a constant in closed form."""
+    few = nb.Tree.from_newick("((a:1,b:1.5)x:.5,c:2);").observing(["x", "a", "c"])
+    names, sizes = list("xxaaac"), np.array([2, 3, 1])
+    many = few.observing(names)
+    data = many.rows(ROWS[:6], names=names)
+    owner = np.repeat(np.arange(3), sizes)
+    means = np.stack([data[owner == i].mean(0) for i in range(3)])
+    match = jax.vmap(nb.InexactMatch)(jnp.asarray(0.1 / sizes))
+    one = nb.DiffusionTree(FLOW, X0, match, tree=few, num_steps=3, per_row=("match",))
+    law = nb.DiffusionTree(FLOW, X0, nb.InexactMatch(0.1), tree=many, num_steps=3)
+    z = jr.normal(key, law.noise_prior().shape())
+    errors = 0.1 / np.asarray(FLOW.space.weights)[:, None]
+    constant = stats.norm(means[owner], np.sqrt(errors)).logpdf(data).sum()
+    constant -= stats.norm(0, np.sqrt(errors / sizes[:, None, None])).logpdf(np.zeros_like(means)).sum()
+    expected = one.given(z).log_prob(means) + constant
+    np.testing.assert_allclose(law.given(z).log_prob(data), expected, rtol=1e-10)
+    np.testing.assert_allclose(law.given(z).path(data), one.given(z).path(means), atol=1e-10)
+
+
+# The root.
+
+ROOTED = nb.Tree(MANY.parents, MANY.lengths, MANY.names, [0, 0, *MANY.observed])  # seen twice itself
+ROOTED_ROWS = np.concatenate([ROWS, ROWS[:2] + 0.5])
+PRIOR = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 0.5]])
+OU = nb.LinearSDE(-0.7, np.linalg.cholesky(Q), 0.4)
+
+
+def test_a_root_with_a_prior_has_the_dense_normal():
+    """Value to 1e-8, gradients to 1e-6."""
+    p = {"x0": jnp.asarray(X0), "root": jnp.asarray(PRIOR), "noise": jnp.asarray(0.1)}
+
+    def ours(p):
+        match = nb.InexactMatch(p["noise"])
+        law = nb.DiffusionTree(OU, p["x0"], match, tree=ROOTED, root_covariance=p["root"])
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(ROOTED_ROWS)
+
+    def truth(p):
+        return joint(ROOTED, p["x0"], ROOTED_ROWS, Q, p["noise"], 0.7, 0.4, 0.5 * (p["root"] + p["root"].T))
+
+    found, slopes = jax.jit(jax.value_and_grad(ours))(p)
+    expected, true_slopes = jax.jit(jax.value_and_grad(truth))(p)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    for key in p:
+        size = 1 + np.max(np.abs(true_slopes[key]))
+        np.testing.assert_allclose(slopes[key], true_slopes[key], rtol=1e-6, atol=1e-6 * size, err_msg=key)
+
+
+@pytest.mark.parametrize("prior", [np.array([2.0, 0.5, 0.1]), PRIOR], ids=["diagonal", "matrix"])
+def test_the_posterior_of_the_root(prior, key):
+    """Every noise weighs the same; the root is drawn from its dense posterior, of which 0 is the mean."""
+    law = nb.DiffusionTree(
+        OU, X0, nb.InexactMatch(0.1), tree=ROOTED, num_steps=2, guide=nb.RecedingGuide(), root_covariance=prior
+    )
+    matrix = np.diag(prior) if prior.ndim == 1 else prior
+    truth = joint(ROOTED, X0, ROOTED_ROWS, Q, 0.1, 0.7, 0.4, matrix)
+    laws = law.expand((8,))
+    z = jr.normal(key, laws.noise_prior().shape())
+    z = z.at[:7, 1:].set(0).at[:4, 0].set(0).at[1:4, 0, :, 0].set(np.eye(3))  # the mean, columns of a factor, any
+    data = np.broadcast_to(ROOTED_ROWS, (8, *ROOTED_ROWS.shape))
+    np.testing.assert_allclose(laws.given(z).log_prob(data), np.full(8, truth), rtol=1e-9)
+    roots = laws.given(z).nodes(data)[:, 0]
+
+    shared = np.asarray(shared_times(ROOTED))
+    depth = np.diag(shared)
+    C = np.exp(-0.7 * (depth[:, None] + depth)) * np.expm1(1.4 * shared) / 1.4
+    errors = np.kron(C, Q) + 0.1 * np.eye(3 * len(depth))
+    decay = np.kron(np.exp(-0.7 * depth)[:, None], np.eye(3))
+    residual = ROOTED_ROWS - (-np.expm1(-0.7 * depth) * 0.4 / 0.7)[:, None, None]
+    precision = decay.T @ np.linalg.solve(errors, decay) + np.linalg.inv(matrix)
+    pull = decay.T @ np.linalg.solve(errors, residual.reshape(-1, 2)) + np.linalg.solve(matrix, X0)
+    np.testing.assert_allclose(roots[0], np.linalg.solve(precision, pull), atol=1e-9)
+    factor = (roots[1:4, :, 0] - roots[0, :, 0]).T
+    np.testing.assert_allclose(factor @ factor.T, np.linalg.inv(precision), atol=1e-9)
+
+
+def test_samples_with_a_root_that_varies():
+    """Tips and root have the covariance of the tree and of the root."""
+    tree = nb.Tree(SMALL.parents, SMALL.lengths, SMALL.names, [0, *SMALL.observed])
+    law = nb.DiffusionTree(
+        nb.BrownianMotion(0.8), np.ones(2), nb.InexactMatch(0.05), tree=tree, root_covariance=np.array([0.5, 2.0])
+    )
+    draws = np.asarray(law.sample(jr.key(2), (8000,)))
+    for i, variance in enumerate((0.5, 2.0)):
+        values = draws[..., i] - 1
+        truth = variance + 0.8 * np.asarray(shared_times(tree)) + 0.05 * np.eye(4)
+        error = np.sqrt((np.outer(np.diag(truth), np.diag(truth)) + truth**2) / len(values))
+        assert np.all(np.abs(values.T @ values / len(values) - truth) < 4.5 * error)
+        assert np.all(error < 0.05 * np.diag(truth).max())
+
+
+# Regimes.
+
+
+def test_rates_are_lengths():
+    """A Brownian motion of its own on each branch, value and gradient in the rates."""
+    rates = jnp.linspace(0.5, 2.0, TREE.num_nodes - 1)
+
+    def by_regime(rates):
+        sdes = jax.vmap(lambda rate: nb.BrownianMotion(rate * Q))(rates)
+        law = nb.DiffusionTree(sdes, X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",))
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
+
+    def by_length(rates):
+        law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, nb.InexactMatch(0.1), tree=TREE.scaled(rates))
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
+
+    found, slopes = jax.jit(jax.value_and_grad(by_regime))(rates)
+    expected, true_slopes = jax.jit(jax.value_and_grad(by_length))(rates)
+    np.testing.assert_allclose(found, expected, rtol=1e-10)
+    np.testing.assert_allclose(slopes, true_slopes, rtol=1e-8, atol=1e-10)
+
+
+def test_regimes_have_the_dense_normal():
+    """Ornstein–Uhlenbeck processes of two kinds, from a root that varies."""
+    kind = TREE.clade("c", "d", "e").astype(int)
+    rate, shift, scale = np.array([0.4, 1.5])[kind], np.array([0.4, -0.6])[kind], np.array([1.0, 0.3])[kind]
+    lengths, size = np.asarray(TREE.lengths), TREE.num_nodes
+    sdes = jax.vmap(lambda r, b, s: nb.LinearSDE(-r, jnp.sqrt(s) * np.linalg.cholesky(Q), b))(rate, shift, scale)
+    law = nb.DiffusionTree(
+        sdes, X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",), root_covariance=0.7 * Q
+    )
+    found = law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
+
+    decay, weight, C = np.exp(-rate * lengths), np.ones(size), 0.7 * np.eye(size)
+    push = np.zeros(size)
+    for node in range(1, size):
+        parent, e = TREE.parents[node], node - 1
+        weight[node] = decay[e] * weight[parent]
+        push[node] = decay[e] * push[parent] + shift[e] * (1 - decay[e]) / rate[e]
+        C[node, :node] = C[:node, node] = decay[e] * C[parent, :node]
+        C[node, node] = decay[e] ** 2 * C[parent, parent] + scale[e] * (1 - decay[e] ** 2) / (2 * rate[e])
+    seen = np.array(TREE.observed)
+    covariance = np.kron(C[np.ix_(seen, seen)], Q) + 0.1 * np.eye(3 * len(seen))
+    r = (DATA - weight[seen, None, None] * X0 - push[seen, None, None]).reshape(-1, 2)
+    truth = sum(stats.multivariate_normal(None, covariance).logpdf(r[:, c]) for c in (0, 1))
+    np.testing.assert_allclose(found, truth, rtol=1e-8)
+
+
+def test_regimes_of_nonlinear_processes(key):
+    """Coefficients r b and √r σ for a time t are b and σ for r t: the same weight; and the way back."""
+    rates = jnp.linspace(0.5, 2.0, TREE.num_nodes - 1)
+
+    def sde(r):
+        return nb.SDE(lambda t, x, r: r * jnp.sin(x), lambda t, x, r: 0.6 * jnp.sqrt(r), r)
+
+    settings = {"num_steps": 3, "root_covariance": 0.3}
+    law = nb.DiffusionTree(jax.vmap(sde)(rates), X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",), **settings)
+    scaled = nb.DiffusionTree(sde(1.0), X0, nb.InexactMatch(0.1), tree=TREE.scaled(rates), **settings)
+    z = jr.normal(key, law.noise_prior().shape())
+    np.testing.assert_allclose(law.given(z).log_prob(DATA), scaled.given(z).log_prob(DATA), rtol=1e-10)
+
+    @jax.jit
+    def there_and_back(key):
+        seen, paths = _simulated(law.parts, key)
+        problem = _problem(law.parts, seen)
+        return paths, problem.paths(problem.noise_from_paths(paths, key))
+
+    paths, again = there_and_back(key)
+    np.testing.assert_allclose(again, paths, atol=1e-10)
 
 
 # Nonlinear processes.
@@ -214,15 +459,29 @@ TEXT_LARGE = "(((a:.3,b:.4)x:.2,c:0):.3,(d:.2,(e:.1,f:.3):.2):.1);"
 LARGE = nb.Tree.from_newick(TEXT_LARGE)
 
 
-@pytest.mark.parametrize("num_steps", [4, 10])
-@pytest.mark.parametrize("tree", [SMALL, LARGE.observing(list("abcdef") + ["x"])], ids=["three tips", "six tips"])
-def test_evidence_by_brute_force(tree, num_steps):
+SEVEN = LARGE.observing(list("abcdef") + ["x"])
+SEEN_ROOT = nb.Tree(SMALL.parents, SMALL.lengths, SMALL.names, [0, *SMALL.observed])
+FORCED = {
+    "three tips, 4 steps": (SMALL, 4, None),
+    "three tips, 10 steps": (SMALL, 10, None),
+    "six tips, 4 steps": (SEVEN, 4, None),
+    "six tips, 10 steps": (SEVEN, 10, None),
+    "a root that varies": (SMALL, 4, 1.5),
+    "a root that varies and is seen": (SEEN_ROOT, 3, 1.5),
+}
+
+
+@pytest.mark.parametrize("name", FORCED)
+def test_evidence_by_brute_force(name):
     """The mean weight, against forward simulation in NumPy weighed by the density of the data."""
+    tree, num_steps, root = FORCED[name]
     rng = np.random.default_rng(num_steps)
     variance, x0, count = 0.3, 0.4, 400_000
     data = rng.normal(0.5, 0.4, (len(tree.observed), 1))
     depths, lengths = np.asarray(tree.depths), np.asarray(tree.lengths)
-    state, log_density = {0: np.full(count, x0)}, np.zeros(count)
+    state, log_density = {0: x0 + np.sqrt(root or 0.0) * rng.normal(size=count)}, np.zeros(count)
+    if 0 in tree.observed:
+        log_density += stats.norm(state[0], np.sqrt(variance)).logpdf(data[0, 0])
     for node in range(1, tree.num_nodes):
         x, t = state[tree.parents[node]], depths[tree.parents[node]]
         dt = lengths[node - 1] / num_steps
@@ -238,7 +497,9 @@ def test_evidence_by_brute_force(tree, num_steps):
     truth, error = weights.mean(), weights.std() / np.sqrt(count)
     assert error < 0.01 * truth
 
-    law = nb.DiffusionTree(sine(1.0), np.array([x0]), nb.InexactMatch(variance), tree=tree, num_steps=num_steps)
+    law = nb.DiffusionTree(
+        sine(1.0), np.array([x0]), nb.InexactMatch(variance), tree=tree, num_steps=num_steps, root_covariance=root
+    )
     z = jr.normal(jr.key(num_steps), (6000, *law.noise_prior().shape()))
     log_weights = jax.jit(jax.vmap(lambda z: law.given(z).log_prob(data)))(z)
     own = np.exp(log_weights)
@@ -254,14 +515,20 @@ KINDS = {
     "some points": (nb.InexactMatch(0.1, PICK := np.eye(3)[[2, 0]]), TREE, nb.FrozenGuide()),
     "chain": (nb.InexactMatch(0.1), nb.Tree.chain([0.5, 0.7, 2.0]), None),
     "one branch": (nb.ExactMatch(), nb.Tree.star([1.2]), None),
+    "a root that varies": (nb.InexactMatch(0.1), ROOTED, None),
+    "fewer noises than states": (nb.InexactMatch(0.1), ROOTED, None),
 }
+OTHERS = {"a root that varies": {"root_covariance": 0.2 * PRIOR}}
+OTHERS["fewer noises than states"] = {"root_covariance": np.array([0.4, 0.2, 0.3])}
+NARROW = nb.SDE(lambda t, x, a: -x, lambda t, x, a: jnp.stack([jnp.cos(x[:, 0]), jnp.ones(3)], 1))
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_the_way_back_to_the_noise(name, key):
     """Simulated paths are those of their noise; paths meet at the nodes, and end in what is seen exactly."""
     match, tree, guide = KINDS[name]
-    law = nb.DiffusionTree(FLOW, X0, match, tree=tree, num_steps=3, guide=guide)
+    sde = NARROW if name.startswith("fewer") else FLOW
+    law = nb.DiffusionTree(sde, X0, match, tree=tree, num_steps=3, guide=guide, **OTHERS.get(name, {}))
 
     @jax.jit
     def there_and_back(key):
@@ -272,15 +539,34 @@ def test_the_way_back_to_the_noise(name, key):
 
     seen, paths, again, log_weight = there_and_back(key)
     np.testing.assert_allclose(again, paths, atol=1e-10)
+    assert (name in OTHERS) == (np.max(np.abs(paths[0, 0] - X0)) > 0)
     assert np.isfinite(log_weight)
     walk = schedule(tree.parents, tree.observed)
     for i, node in enumerate(walk.active):
         parent = tree.parents[node]
-        start = X0 if parent == 0 else paths[walk.active.index(parent), -1]
+        start = paths[0, 0] if parent == 0 else paths[walk.active.index(parent), -1]
         np.testing.assert_allclose(paths[i, 0], start, atol=1e-12)
     if isinstance(match, nb.ExactMatch):
         ends = [paths[walk.active.index(node), -1] for node in tree.observed]
         np.testing.assert_allclose(ends, seen, atol=1e-12)
+
+
+@pytest.mark.parametrize("columns", [(), (2,)], ids=["vectors", "columns"])
+def test_states_of_all_nodes(columns, key):
+    """Ends of the branches in the tree's order; NaN where a node leads to nothing seen, and where the law is masked."""
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0[(..., *(0,) * (1 - len(columns)))], nb.InexactMatch(0.1), tree=TREE)
+    data = DATA[(..., *(0,) * (1 - len(columns)))]
+    law = law.expand((2,)).given(jr.normal(key, law.expand((2,)).noise_prior().shape()))
+    data = np.stack([data, data + 1])
+    states, paths = law.nodes(data), law.path(data)
+    assert states.shape == (2, TREE.num_nodes, 3, *columns)
+    active = schedule(TREE.parents, TREE.observed).active
+    np.testing.assert_array_equal(states[:, np.array(active)], paths[:, :, -1])
+    np.testing.assert_array_equal(states[0, 0], law.parts["x0"])
+    unseen = sorted(set(range(TREE.num_nodes)) - {0, *active})
+    assert [TREE.names[node] for node in unseen] == [None, "u"] and np.all(np.isnan(states[:, np.array(unseen)]))
+    masked = law.mask(np.array([True, False])).nodes(data)
+    assert np.all(np.isnan(masked[1])) and np.array_equal(masked[0], states[0], equal_nan=True)
 
 
 def test_one_branch_is_an_endpoint(key):
@@ -333,6 +619,14 @@ def test_prior_predictive():
     assert np.all(np.abs(values.T @ values / len(values) - truth) < 4.5 * error)
 
 
+def test_specimens_share_the_state_of_their_node():
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, nb.InexactMatch(1e-8), tree=MANY)
+    draws = law.sample(jr.key(0), (200,))
+    between = draws - draws[:, [MANY.observed.index(node) for node in MANY.observed]]
+    repeats = between[:, np.array(MANY.observed) == np.roll(MANY.observed, 1)]
+    assert repeats.std() == pytest.approx(np.sqrt(2e-8), rel=0.05) and draws.std() > 0.5
+
+
 def test_branch_lengths_have_priors():
     def clock(data):
         rates = numpyro.sample("rates", dist.LogNormal(0.0, 0.5).expand([SMALL.num_nodes - 1]).to_event(1))
@@ -364,7 +658,7 @@ def test_priors_on_everything_in_both_precisions():
         flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale), noise=nb.LandmarkNoise(1e-5))
         match = jax.vmap(lambda sd: nb.InexactMatch(sd**2, space=space))(sd)
         tree_law = nb.DiffusionTree(
-            flow, start, match, tree=tree.scaled(rates), num_steps=4, guide=guide, per_node=("match",)
+            flow, start, match, tree=tree.scaled(rates), num_steps=4, guide=guide, per_row=("match",)
         )
         nb.sample("tips", tree_law, obs=data)
 
@@ -391,14 +685,40 @@ WRONG = {
     "tree": (lambda: law(tree="(a:1);"), "`tree` must be a `Tree`"),
     "match": (lambda: law(match=nb.FrozenGuide()), "`match` must be a model of observation"),
     "root": (lambda: law(tree=nb.Tree([-1, 0], [1.0], None, [0, 1])), "`tree` must not have its root among"),
+    "root alone": (
+        lambda: law(tree=nb.Tree([-1, 0], [1.0], None, [0]), root_covariance=1.0),
+        "`tree` must have a seen node besides its root",
+    ),
+    "prior": (lambda: law(root_covariance=np.ones(2)), r"`root_covariance` must be a number, \(3,\) or \(3, 3\)"),
+    "no prior": (lambda: law(root_covariance=-1.0), "`root_covariance` must be positive definite"),
     "steps": (lambda: law(sde=sine(1.0)), "`num_steps` must be given"),
     "no steps": (lambda: law(num_steps=0), "`num_steps` must be a positive integer; got 0"),
     "inner exact": (lambda: law(match=nb.ExactMatch()), "1 of the seen nodes are no tips"),
+    "several exact": (
+        lambda: law(match=nb.ExactMatch(), tree=TREE.observing(list("aabcc"))),
+        "and 2 rows are of nodes that have one",
+    ),
     "bins": (lambda: law(match=nb.IntervalCensored([0.0])), "`match` must see a value at each node"),
-    "per_node": (lambda: law(per_node=("sde",)), "`per_node` may hold 'match'"),
+    "per_edge": (lambda: law(per_edge=("match",)), "`per_edge` may hold 'sde'"),
+    "one SDE": (
+        lambda: law(sde=nb.BrownianMotion(Q), per_edge=("sde",)),
+        "`sde` is in `per_edge`, so every array of it must have 13 rows, one for each branch",
+    ),
+    "no arrays": (
+        lambda: law(sde=nb.SDE(lambda t, x, a: -x, lambda t, x, a: 1.0), per_edge=("sde",), num_steps=2),
+        "`sde` is in `per_edge`, and has no array to have one for each branch",
+    ),
+    "spaces": (
+        lambda: law(
+            sde=jax.vmap(lambda w: nb.BrownianMotion(w, space=nb.Landmarks(3, 2, weights=w)))(jnp.arange(1.0, 14.0)),
+            per_edge=("sde",),
+        ),
+        "`sde` must have one space on all branches",
+    ),
+    "per_row": (lambda: law(per_row=("sde",)), "`per_row` may hold 'match'"),
     "rows of matches": (
-        lambda: law(match=jax.vmap(nb.InexactMatch)(jnp.ones(3)), per_node=("match",)),
-        "`match` is in `per_node`, so every array of it must have 8 rows",
+        lambda: law(match=jax.vmap(nb.InexactMatch)(jnp.ones(3)), per_row=("match",)),
+        "`match` is in `per_row`, so every array of it must have 8 rows",
     ),
     "data": (lambda: density(DATA[:3]), r"`value`, an observation, must have shape \(8, 3, 2\)"),
     "several trees": (lambda: density(np.stack([DATA, DATA])), "holds 2 observations.*One noise shared"),

@@ -52,7 +52,8 @@ PLAIN = nb.LinearSDE(-0.3, np.array([0.4, 0.3, 0.5]), space=POINTS)
 ACTUAL = nb.InexactMatch(0.05).at(SEEN)
 TREE = nb.Tree.from_newick("((a:0.5,b:0):0.3,c:1);")
 SEVERAL = np.stack([SEEN, X0, 0.5 * SEEN])
-ROWS = jax.vmap(nb.InexactMatch)(np.array([0.05, 0.1, 0.07]))
+ERRORS = np.array([0.05, 0.1, 0.07])
+ROWS = jax.vmap(nb.InexactMatch)(ERRORS)
 
 
 def noise(shape):
@@ -280,13 +281,25 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
     "DiffusionTree": (
         nb.DiffusionTree,
         {"sde": GBM, "x0": times(X0), "match": ROWS, "tree": Of(lambda t: TREE.scaled(t)), "num_steps": 2}
-        | {"t0": times(0.1), "guide": nb.RecedingGuide(0.1), "per_node": ("match",)},
+        | {"t0": times(0.1), "guide": nb.RecedingGuide(0.1), "per_row": ("match",)},
+        lambda law: observed(law, SEVERAL),
+    ),
+    "DiffusionTree, specimens": (
+        nb.DiffusionTree,
+        {"sde": PLAIN, "x0": times(X0), "match": Of(lambda t: jax.vmap(nb.InexactMatch)(t * ERRORS))}
+        | {"tree": TREE.observing(list("aab")), "per_row": ("match",)},
+        lambda law: observed(law, SEVERAL),
+    ),
+    "DiffusionTree, regimes": (
+        nb.DiffusionTree,
+        {"sde": Of(lambda t: jax.vmap(nb.BrownianMotion)(t * np.array([0.5, 1.0, 0.7, 0.3]))), "x0": X0}
+        | {"match": nb.InexactMatch(0.05), "tree": TREE, "per_edge": ("sde",)},
         lambda law: observed(law, SEVERAL),
     ),
     "DiffusionTree, batch": (
         nb.DiffusionTree,
         {"sde": PLAIN, "x0": times(BATCH), "match": nb.InexactMatch(0.05), "tree": TREE, "num_steps": 1}
-        | {"batch_shape": (2,), "batched": ("x0",)},
+        | {"root_covariance": times([0.5, 0.2]), "batch_shape": (2,), "batched": ("x0", "root_covariance")},
         lambda law: observed(law, np.stack([SEVERAL, SEVERAL])),
     ),
 }  # fmt: skip

@@ -6,6 +6,7 @@ from ._base import (
     lift as lift,
 )
 from ._cylinder import CylinderSet as CylinderSet, IntervalCensored as IntervalCensored
+from ._fused import fused as fused
 from ._match import ExactMatch as ExactMatch, InexactMatch as InexactMatch
 from ._message import (
     GaussianMessage as GaussianMessage,

@@ -187,12 +187,12 @@ def _bridge(parts, value) -> GuidedBridge:
     return GuidedBridge(parts["sde"], condition, x0=parts["x0"], ts=parts["ts"], guide=parts["guide"])
 
 
-def close_parts(parts, one, names, num_axes, ts) -> None:
-    """Freezes what users' functions read, for one law and for the batch."""
+def close_parts(parts, one, names, num_axes, ts, several=()) -> None:
+    """Freezes what users' functions read, for one law and for the batch; `several`: parts of which a law has many."""
 
     def set_closed(name, close):
         one[name] = close(one[name])
-        for _ in range(num_axes if name in names else 0):
+        for _ in range((num_axes if name in names else 0) + (name in several)):
             close = eqx.filter_vmap(close)
         parts[name] = close(parts[name])
 

@@ -8,18 +8,21 @@ bound, is the log weight Ψ of guided paths along all branches (`trees/_sweep.py
 A bridge is the tree with one branch, a time series is a chain.
 """
 
+from collections import Counter
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jaxtyping import ArrayLike
 
-from .._checks import as_float, positive_integer, require, require_finite, require_instance
+from .._checks import as_float, concrete, positive_integer, require, require_finite, require_instance, words
 from .._types import RealScalar, State
-from ..conditioning import AbstractMatch
+from ..conditioning import AbstractMatch, fused
 from ..guiding import AbstractGuide
-from ..sdes import AbstractSDE
-from ..trees import Tree, TreeProblem, schedule
+from ..sdes import AbstractSDE, as_covariance
+from ..trees import Root, Tree, TreeProblem, schedule
 from ._batch import as_shape, find_batched, one_of
 from ._endpoint import check_law, close_parts, names_of, seen_shape
 from ._noise_driven import AbstractNoiseDriven
@@ -29,7 +32,8 @@ class _Settings(eqx.Module):
     """What is known of a law before tracing."""
 
     num_steps: int = eqx.field(static=True)
-    per_node: tuple[str, ...] = eqx.field(static=True)
+    per_row: tuple[str, ...] = eqx.field(static=True)
+    per_edge: tuple[str, ...] = eqx.field(static=True)
 
 
 class DiffusionTree(AbstractNoiseDriven):
@@ -43,11 +47,16 @@ class DiffusionTree(AbstractNoiseDriven):
 
     **Arguments:**
 
-    - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths.
-    - `x0`: the state at the root, `(n, dim)` or `(n,)`.
-    - `match`: how a node is seen, the same for all, or one for each row with `per_node=("match",)`: every array with an
-      axis `(m,)` in front, as `jax.vmap` of a constructor returns it. So each tip has an error of its own, or its own
-      `mask` of an `InexactMatch`.
+    - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths; or one for each branch with
+      `per_edge=("sde",)`, every array with an axis `(num_nodes - 1,)` in front, in the order of `tree.lengths`, as
+      `jax.vmap` of a constructor returns it. They have one space.
+    - `x0`: the state at the root, `(n, dim)` or `(n,)`; with a `root_covariance` the mean of its prior.
+    - `root_covariance`: C of the prior N(x0, C) of the state at the root, `()`, `(n,)` (a diagonal) or `(n, n)`, acting
+      on each coordinate column; left out, the root is at x0. It is marginalised, exactly where the SDE is linear.
+    - `match`: how a node is seen, the same for all, or one for each row of data with `per_row=("match",)`: every array
+      with an axis `(m,)` in front, as `jax.vmap` of a constructor returns it. So each row has an error of its own, or
+      its own `mask` of an `InexactMatch`. Rows of one node are independent given its state: the variance of the match
+      is then the variation within species.
     - `tree`: a `Tree`. Its lengths may be parameters.
     - `num_steps`: steps on each branch; 1 unless given where the SDE has its exact transition (`LinearSDE`,
       `BrownianMotion`).
@@ -55,14 +64,14 @@ class DiffusionTree(AbstractNoiseDriven):
     - `guide`: as for `GuidedBridge`, for every branch.
     - `batch_shape`, `batched`: several trees with parts of their own, as for `DiffusionEndpoint`.
 
-    **Shapes:** `event_shape` is `(m, ...)`, one observation for each node of `tree.observed`; data come in that order
+    **Shapes:** `event_shape` is `(m, ...)`, one observation for each entry of `tree.observed`; data come in that order
     by `tree.rows`. The noise has shape `(branches * num_steps, k, dim)`, branches in preorder, those alone that lead to
-    something seen.
+    something seen. With a prior of the root ⌈n / k⌉ rows are in front.
 
     For a linear SDE with the default guide the density does not depend on the noise: it is the likelihood.
 
-    **Errors:** `ValueError` as for `DiffusionEndpoint`, for `IntervalCensored`, for an exact match of an inner node,
-    and for a seen root.
+    **Errors:** `ValueError` as for `DiffusionEndpoint`, for `IntervalCensored`, for an exact match of an inner node
+    or of a node with several rows, and for a seen root that has no prior.
     """
 
     def __init__(
@@ -75,7 +84,9 @@ class DiffusionTree(AbstractNoiseDriven):
         num_steps: int | None = None,
         t0: RealScalar = 0.0,
         guide: AbstractGuide | None = None,
-        per_node: tuple[str, ...] = (),
+        root_covariance: ArrayLike | None = None,
+        per_row: tuple[str, ...] = (),
+        per_edge: tuple[str, ...] = (),
         batch_shape: tuple[int, ...] = (),
         batched: tuple[str, ...] | None = None,
         validate_args: bool | None = None,
@@ -88,27 +99,36 @@ class DiffusionTree(AbstractNoiseDriven):
         require_instance(tree, Tree, "tree", "a `Tree`, such as `Tree.from_newick(text)`")
         if guide is not None:
             require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
-        require(0 not in tree.observed, "`tree` must not have its root among the seen nodes: `x0` is where it is.")
-        own = names_of(per_node) or ()
-        require(set(own) <= {"match"}, f"`per_node` may hold 'match'; got {per_node}.")
+        require(
+            root_covariance is not None or 0 not in tree.observed,
+            "`tree` must not have its root among the seen nodes: `x0` is where it is. Give it a prior by "
+            "`root_covariance`.",
+        )
+        require(any(tree.observed), "`tree` must have a seen node besides its root, which no branch leads to.")
+        prior = None if root_covariance is None else as_covariance(root_covariance, "root_covariance")
+        own, own_edges = names_of(per_row) or (), names_of(per_edge) or ()
+        require(set(own) <= {"match"}, f"`per_row` may hold 'match'; got {per_row}.")
+        require(set(own_edges) <= {"sde"}, f"`per_edge` may hold 'sde'; got {per_edge}.")
         require(
             num_steps is not None or sde.has_exact_transition,
             "`num_steps` must be given, for every branch: this SDE is stepped by Euler's scheme.",
         )
-        settings = _Settings(positive_integer(1 if num_steps is None else num_steps, "num_steps"), own)
+        settings = _Settings(positive_integer(1 if num_steps is None else num_steps, "num_steps"), own, own_edges)
         batch_shape = as_shape(batch_shape, "batch_shape")
         declared = names_of(batched)
         start = as_float(t0, "t0")
         require(start.ndim == 0, f"`t0` must be one time; got shape {start.shape}.")
         parts = {"sde": sde, "x0": x0, "match": match, "guide": guide, "tree": tree, "t0": start, "settings": settings}
+        parts["root_covariance"] = prior
         names = find_batched(parts, batch_shape, declared, _check)
-        one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
-        datum = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(one))))
+        one = _simplest(one_of(parts, names, batch_shape, (0,) * len(batch_shape)))
+        datum = jnp.zeros((len(tree.observed), *seen_shape(one)))
         _check_condition(one, datum)
-        close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1))
+        close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1), own_edges)
         branches = len(schedule(tree.parents, tree.observed).active)
         columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
-        noise_shape = (branches * settings.num_steps, one["sde"].noise_size(one["x0"]), columns)
+        k = one["sde"].noise_size(one["x0"])
+        noise_shape = (_root(one).num_rows(k) + branches * settings.num_steps, k, columns)
         super().__init__(
             parts, names, declared is not None, batch_shape, datum.shape, noise_shape, validate_args, ("t0",)
         )
@@ -125,6 +145,14 @@ class DiffusionTree(AbstractNoiseDriven):
         NaN where the law is masked.
         """
         return self._paths_to(observed, _paths)
+
+    def nodes(self, observed):
+        """States of all nodes of the tree, given `observed` and the bound noise: ancestors among them.
+
+        Batch axes and then `(num_nodes, n, dim)`, `(num_nodes, n)` for vector states, in the order of `tree.names`: the
+        root first, node i at i. Nodes that lead to nothing seen have no noise and are NaN, all where the law is masked.
+        """
+        return self._paths_to(observed, _nodes)
 
     @staticmethod
     def _observe(parts, key):
@@ -147,40 +175,65 @@ class DiffusionTree(AbstractNoiseDriven):
     @staticmethod
     def _check_data(parts, values):
         """Row by row, each by its own match where they have some."""
-        own = "match" in parts["settings"].per_node
+        own = "match" in parts["settings"].per_row
         for i, row in enumerate(np.swapaxes(values, 0, 1)):
             match = jax.tree.map(lambda a, i=i: a[i], parts["match"]) if own else parts["match"]
             for value in row:
                 match.at(value)
 
 
-def _of_one_node(parts):
-    """The parts of the law of one node."""
-    own = parts["settings"].per_node
-    return {name: jax.tree.map(lambda a: a[0], part) if name in own else part for name, part in parts.items()}
+def _simplest(parts):
+    """The parts of the law of one node and one branch."""
+    own = parts["settings"].per_row + parts["settings"].per_edge
+    return {name: _first(part) if name in own else part for name, part in parts.items()}
+
+
+def _first(part):
+    return jax.tree.map(lambda a: a[0] if eqx.is_array(a) else a, part)
 
 
 def _check(parts):
     """Raises unless the parts make one law."""
-    rows = len(parts["tree"].observed)
-    for name in parts["settings"].per_node:
-        for leaf in jax.tree.leaves(parts[name]):
-            require(
-                leaf.ndim > 0 and leaf.shape[0] == rows,
-                f"`{name}` is in `per_node`, so every array of it must have {rows} rows, one for each seen node; got "
-                f"shape {leaf.shape}. Build it by `jax.vmap`.",
-            )
-    check_law(_of_one_node(parts))
+    tree, settings = parts["tree"], parts["settings"]
+    for name in settings.per_row:
+        _check_axis(parts[name], len(tree.observed), f"`{name}` is in `per_row`", "row of data")
+    for name in settings.per_edge:
+        _check_axis(parts[name], tree.num_nodes - 1, f"`{name}` is in `per_edge`", "branch")
+        for value in map(concrete, jax.tree.leaves(parts[name].space)):
+            require(value is None or np.all(value == value[:1]), f"`{name}` must have one space on all branches.")
+    check_law(_simplest(parts))
+    prior, n = parts["root_covariance"], parts["x0"].shape[0]
+    require(
+        prior is None or prior.ndim == 0 or prior.shape[0] == n,
+        f"`root_covariance` must be a number, ({n},) or ({n}, {n}), as the state has {n} rows; got {words(prior)}.",
+    )
+
+
+def _check_axis(part, size, why, what):
+    leaves = [leaf for leaf in jax.tree.leaves(part) if eqx.is_array(leaf)]
+    require(len(leaves) > 0, f"{why}, and has no array to have one for each {what}: leave it out.")
+    for leaf in leaves:
+        require(
+            leaf.ndim > 0 and leaf.shape[0] == size,
+            f"{why}, so every array of it must have {size} rows, one for each {what}; got shape {leaf.shape}. Build it "
+            "by `jax.vmap`.",
+        )
 
 
 def _check_condition(parts, datum):
-    tree, condition = parts["tree"], _of_one_node(parts)["match"].at(datum[0])
+    tree, condition = parts["tree"], parts["match"].at(datum[0])
     require(
         condition.num_extra_noises == 0,
         "`match` must see a value at each node, such as `InexactMatch(variance)`: branches are not led to sets.",
     )
     if not condition.exact:
         return
+    twice = len(tree.observed) - len(set(tree.observed))
+    require(
+        not twice,
+        f"`match` must have an error where nodes have several rows, and {twice} rows are of nodes that have one "
+        "already: use an `InexactMatch`, of the variance within species.",
+    )
     inner = [node for node in tree.observed if node not in tree.tips]
     require(
         not inner,
@@ -195,10 +248,21 @@ def _problem(parts, value) -> TreeProblem:
 
 
 def _unled(parts, value) -> TreeProblem:
-    match, own = parts["match"], parts["settings"].per_node
-    conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if "match" in own else None, 0))(match, value)
-    steps = parts["settings"].num_steps
-    return TreeProblem.of(parts["sde"], parts["guide"], parts["x0"], parts["tree"], conditions, steps, parts["t0"])
+    match, x0, tree, settings = parts["match"], parts["x0"], parts["tree"], parts["settings"]
+    sde, sdes = parts["sde"], None
+    if "sde" in settings.per_edge:
+        sde, sdes = _first(sde), sde
+    own = "match" in settings.per_row
+    sizes = tuple(Counter(tree.observed).values())
+    if max(sizes) > 1:
+        conditions = fused(match, value, sizes, own, sde, x0)
+    else:
+        conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(match, value)
+    return TreeProblem.of(sde, parts["guide"], _root(parts), tree, conditions, settings.num_steps, parts["t0"], sdes)
+
+
+def _root(parts) -> Root:
+    return Root.of(parts["x0"], parts["root_covariance"])
 
 
 def _driving(parts, noise):
@@ -210,17 +274,21 @@ def _paths(parts, value, noise):
     return _problem(parts, value).paths(_driving(parts, noise))
 
 
+def _nodes(parts, value, noise):
+    problem = _problem(parts, value)
+    return problem.at_nodes(problem.paths(_driving(parts, noise)))
+
+
 def _simulated(parts, key):
     """What is seen, and the paths of the branches that lead to it."""
     key_path, key_seen = jr.split(key)
-    tree, sde, match, own = parts["tree"], parts["sde"], parts["match"], parts["settings"].per_node
-    blank = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(parts))), parts["x0"].dtype)
+    tree, match, own = parts["tree"], parts["match"], parts["settings"].per_row
+    blank = jnp.zeros((len(tree.observed), *seen_shape(_simplest(parts))), parts["x0"].dtype)
     problem = _unled(parts, blank)
-    x0, branches = problem.x0, problem.schedule.active
-    shape = (len(branches) * problem.num_steps, sde.noise_size(x0), *x0.shape[1:])
+    sde, x0 = problem.sde, problem.x0
+    shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])
     paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))
-    row = {node: i for i, node in enumerate(branches)}
-    ends = paths[np.array([row[node] for node in tree.observed]), -1]
+    ends = problem.at_nodes(paths)[np.array(tree.observed)]
     keys = jr.split(key_seen, len(ends))
     draw = jax.vmap(lambda match, key, x: match.sample(key, sde, x), in_axes=(0 if "match" in own else None, 0, 0))
     return draw(match, keys, ends), paths

@@ -33,6 +33,7 @@ from .._types import State
 from ..conditioning import AbstractCondition, GaussianMessage, Observation, lift
 from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, arrive, default_guide, retrace, retrace_arrival, travel
 from ..sdes import AbstractSDE, BrownianMotion, Displaced
+from ._root import Root
 from ._schedule import Schedule, schedule
 from ._told import Told, as_seen, earlier, nothing_told, told_by
 from ._tree import Tree
@@ -77,6 +78,8 @@ class Branch(NamedTuple):
     anchor: State
     """A state near which coefficients are linearised: where the branch is expected to end."""
     parent_anchor: State
+    own: AbstractSDE | None = None
+    """The arrays of an SDE of its own; `None` where all branches have the same."""
 
 
 class UpwardPass(NamedTuple):
@@ -102,8 +105,9 @@ class TreeProblem(eqx.Module):
     """A tree, what is seen of it, and how its paths are led."""
 
     sde: AbstractSDE
+    """Of all branches; where they have their own, of one of them, for what they have in common."""
     guide: AbstractGuide
-    x0: State
+    root: Root
     branches: Branch
     conditions: AbstractCondition
     """One for each seen node, along a leading axis."""
@@ -113,39 +117,69 @@ class TreeProblem(eqx.Module):
     schedule: Schedule = eqx.field(static=True)
 
     @classmethod
-    def of(cls, sde, guide, x0, tree: Tree, conditions: AbstractCondition, num_steps: int, t0) -> "TreeProblem":
-        """With every anchor at the root: for linear processes, for simulation, and before `anchored`."""
+    def of(cls, sde, guide, root: Root, tree: Tree, conditions, num_steps: int, t0, own) -> "TreeProblem":
+        """With every anchor at the root: for linear processes, for simulation, and before `anchored`.
+
+        `own`: the SDEs of all branches along a leading axis, `sde` being one of them, or `None`.
+        """
+        x0 = root.x0
         guide = default_guide(sde, x0) if guide is None else guide
-        walk = schedule(tree.parents, tree.observed)
+        observed = tuple(dict.fromkeys(tree.observed))
+        walk = schedule(tree.parents, observed)
         above = np.array(tree.parents[1:])
         clock = jnp.zeros_like(tree.lengths)
         if not sde.is_autonomous(x0):
             clock = t0 + tree.depths[above]
 
         at_root = jnp.broadcast_to(x0, (tree.num_nodes - 1, *x0.shape))
-        branches = Branch(tree.lengths, clock, at_root, at_root)
-        return cls(sde, guide, x0, branches, conditions, tree.parents, tree.observed, num_steps, walk)
+        branches = Branch(tree.lengths, clock, at_root, at_root, eqx.filter(own, eqx.is_array))
+        return cls(sde, guide, root, branches, conditions, tree.parents, observed, num_steps, walk)
 
     def anchored(self, t0) -> "TreeProblem":
         """With anchors where a Brownian motion would be, given the data, for processes and guides that need some."""
         if self.sde.has_exact_transition or self.follows:
             return self
-        a = self.sde.covariance(t0, self.x0)
-        variance = jnp.mean(jnp.diagonal(a)) if a.ndim == 2 else jnp.mean(a)
-        walker = BrownianMotion(jnp.where(variance > 0, variance, 1.0))
-        rough = replace(self, sde=walker, guide=FrozenGuide(), num_steps=1)
+        walker, own = self._walker(None, t0), self.branches.own
+        own = None if own is None else jax.vmap(lambda own: self._walker(own, t0))(own)
+        branches = self.branches._replace(own=own)
+        rough = replace(self, sde=walker, guide=FrozenGuide(), num_steps=1, branches=branches)
         active = np.array(self.schedule.active)
-        still = jnp.zeros((len(active), *self.x0.shape), self.x0.dtype)
+        still = jnp.zeros((rough.num_noises, *self.x0.shape), self.x0.dtype)
         paths, _ = rough.down(rough.up(), still)
         anchors = jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape)).at[active].set(paths[:, -1])
+        anchors = anchors.at[0].set(paths[0, 0])
         above = np.array(self.parents[1:])
-        return replace(self, branches=self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above]))
+        branches = self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above])
+        return replace(self, root=replace(self.root, anchor=anchors[0]), branches=branches)
+
+    def _walker(self, own: AbstractSDE | None, t0) -> BrownianMotion:
+        """As fast as a branch's process is at the root."""
+        a = self._sde_of(own).covariance(t0, self.x0)
+        variance = jnp.mean(jnp.diagonal(a)) if a.ndim == 2 else jnp.mean(a)
+        return BrownianMotion(jnp.where(variance > 0, variance, 1.0), space=self.sde.space)
+
+    @property
+    def x0(self) -> State:
+        """The state at the root, or its prior mean."""
+        return self.root.x0
+
+    @property
+    def num_root_rows(self) -> int:
+        """Rows of noise in front of those of the branches."""
+        return self.root.num_rows(self.sde.noise_size(self.x0))
+
+    @property
+    def num_noises(self) -> int:
+        """Rows of noise."""
+        return self.num_root_rows + len(self.schedule.active) * self.num_steps
 
     @property
     def follows(self) -> bool:
         """Whether what is seen below a node is told by a mean, for the guide's covariances to follow the state."""
+        if self.branches.own is not None:
+            return False
         branch = jax.tree.map(lambda a: a[0], self.branches)
-        seen, _ = self._seen(jax.tree.map(lambda a: a[0], self.conditions), branch)
+        seen = jax.tree.map(lambda a: a[0], self.conditions).observation(self.sde, self.x0)
         return self.guide.follows(self._edge(branch), seen, jnp.zeros_like(self.x0))
 
     @property
@@ -164,6 +198,12 @@ class TreeProblem(eqx.Module):
     def paths(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, "branches K+1 n *dim"]:
         """States along every branch that has noise, in preorder."""
         return self.down(self.up(), noise)[0]
+
+    def at_nodes(self, paths: Float[Array, "branches K+1 n *dim"]) -> Float[Array, "nodes n *dim"]:
+        """The states of all nodes, from those along the branches; NaN for nodes that lead to nothing seen."""
+        states = jnp.full((len(self.parents), *self.x0.shape), jnp.nan, paths.dtype)
+        root = paths[0, 0]  # the first branch, in preorder, starts there
+        return states.at[np.array(self.schedule.active)].set(paths[:, -1]).at[0].set(root)
 
     @full_precision
     def noise_from_paths(self, paths, key: PRNGKeyArray) -> Float[Array, "steps k *dim"]:
@@ -184,6 +224,7 @@ class TreeProblem(eqx.Module):
             last = retrace_arrival(edge, seen, ts, y[-2], y[-1], observed, key_end)
             return jnp.concatenate([z, last[None]])
 
+        key_root, key = jr.split(key)
         keys = jr.split(key, len(walk.active))
         at_inner, at_ends = ([place[node] for node in nodes] for nodes in (walk.inner, walk.ends))
         own, others = (_picked((paths, keys), rows) for rows in (at_inner, at_ends))
@@ -193,14 +234,16 @@ class TreeProblem(eqx.Module):
             branches = self._of(walk.inner)
             z = jax.vmap(inner)(branches, up.plans, up.data, *own)
             noise = noise.at[np.array(at_inner)].set(z)
-        return noise.reshape(-1, *noise.shape[2:])
+        at_root = self.root.noise_of(up.at_root, paths[0, 0], noise.shape[2], key_root)
+        return jnp.concatenate([at_root, noise.reshape(-1, *noise.shape[2:])])
 
     @full_precision
     def simulate(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, "branches K+1 n *dim"]:
         """Unconditioned paths along every branch that has noise, in preorder."""
         walk = self.schedule
+        at_root, noise = noise[: self.num_root_rows], noise[self.num_root_rows :]
         noise = noise.reshape(len(walk.active), self.num_steps, *noise.shape[1:])
-        states = jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape))
+        states = jnp.broadcast_to(self.root.prior(at_root), (len(self.parents), *self.x0.shape))
 
         def step(states, inputs):
             node, parent, branch, is_end, z = inputs
@@ -235,8 +278,15 @@ class TreeProblem(eqx.Module):
     def _of(self, nodes: Sequence[int]) -> Branch:
         return _picked(self.branches, [node - 1 for node in nodes])
 
+    def _anchors(self, nodes: Sequence[int]) -> Float[Array, "nodes n *dim"]:
+        """Of some nodes, the root among them."""
+        return jnp.concatenate([self.root.anchor[None], self.branches.anchor])[np.array(nodes, int)]
+
     def _edge(self, branch: Branch) -> Displaced:
-        return Displaced(self.sde, branch.anchor, branch.clock)
+        return Displaced(self._sde_of(branch.own), branch.anchor, branch.clock)
+
+    def _sde_of(self, own: AbstractSDE | None) -> AbstractSDE:
+        return self.sde if own is None else eqx.combine(own, self.sde)
 
     def _inner_plan(self, branch: Branch, seen: Observation, reference: State, *beyond) -> AbstractPlan:
         """With an entry at the end too: the last step to an inner node is led like the others."""
@@ -253,15 +303,15 @@ class TreeProblem(eqx.Module):
         message = GaussianMessage(message.operator, shift, message.factor, observed, message.log_scale)
         return _information(message, self.x0)
 
-    def _seen(self, condition: AbstractCondition, branch: Branch) -> tuple[Observation, State]:
-        """What is seen of the end of a branch, a displacement from its anchor."""
+    def _seen(self, condition: AbstractCondition, anchor: State) -> tuple[Observation, State]:
+        """What is seen of a node, a displacement from its anchor."""
         seen = condition.observation(self.sde, self.x0)
-        displaced = condition.displaced(apply(seen.operator, branch.anchor))
+        displaced = condition.displaced(apply(seen.operator, anchor))
         extra = jnp.zeros((0,), self.x0.dtype)
         return seen, displaced.target(self.x0, jnp.ones((), self.x0.dtype), extra).value
 
     def _led(self, condition, branch: Branch) -> Led:
-        seen, observed = self._seen(condition, branch)
+        seen, observed = self._seen(condition, branch.anchor)
         ts = self._grid(branch.length, condition.exact)
         here = jnp.zeros_like(self.x0)
         reference = lift(seen.operator, here, observed) if self.follows else here
@@ -280,8 +330,8 @@ class TreeProblem(eqx.Module):
             message = self._start_message(led.plan, branch, led.observed)
             return message._replace(c=message.c + led.seen.log_scale)
 
-        def of_node(condition, branch):
-            seen, observed = self._seen(condition, branch)
+        def of_node(condition, anchor):
+            seen, observed = self._seen(condition, anchor)
             factor = seen.factor if seen.factor is not None else jnp.zeros((), self.x0.dtype)
             message = GaussianMessage(seen.operator, jnp.zeros_like(observed), factor, observed, seen.log_scale)
             return _information(message, self.x0)
@@ -304,8 +354,8 @@ class TreeProblem(eqx.Module):
         def of_end(led, branch):
             return told_by(led.seen, led.observed, branch.length, a, n)
 
-        def of_node(condition, branch):
-            return told_by(*self._seen(condition, branch), jnp.zeros((), self.x0.dtype), a, n)
+        def of_node(condition, anchor):
+            return told_by(*self._seen(condition, anchor), jnp.zeros((), self.x0.dtype), a, n)
 
         def joined(total, branch):
             return earlier(total, branch.length, a), total
@@ -326,9 +376,9 @@ class TreeProblem(eqx.Module):
         above = np.array(self.parents)[list(schedule.ends)]
         totals = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), nothing)
         totals = jax.tree.map(lambda a, b: a.at[above].add(b), totals, messages)
-        inside = [node for node in schedule.inner if node in self.observed]
+        inside = [node for node in (0, *schedule.inner) if node in self.observed]
         if inside:
-            own = jax.vmap(of_node)(self._rows(inside), self._of(inside))
+            own = jax.vmap(of_node)(self._rows(inside), self._anchors(inside))
             totals = jax.tree.map(lambda a, b: a.at[np.array(inside)].add(b), totals, own)
         return totals
 
@@ -362,19 +412,21 @@ class TreeProblem(eqx.Module):
         return jax.tree.map(lambda a, b: a[0] + b[0], own, kept), jax.tree.map(lambda a: jnp.flip(a, 0), out)
 
     def log_evidence(self, up: UpwardPass) -> Float[Array, ""]:
-        """The message at the root: the log likelihood itself where the process is linear."""
-        return up.at_root.c  # the root's anchor is x0
+        """The message at the root under its prior: the log likelihood itself where the process is linear."""
+        return self.root.log_evidence(up.at_root)
 
     def down(self, up: UpwardPass, noise: Float[Array, "steps k *dim"]):
         """States of every active node's branch `(active, K + 1, n, dim)`, and Ψ."""
         schedule, K = self.schedule, self.num_steps
         place = {node: i for i, node in enumerate(schedule.active)}
+        at_root, noise = noise[: self.num_root_rows], noise[self.num_root_rows :]
+        root, root_weight = self.root.posterior(up.at_root, at_root)
         noise = noise.reshape(len(schedule.active), K, *noise.shape[1:])
         inner, ends = schedule.inner, schedule.ends
         at_inner = np.array([place[node] for node in inner], int)
         at_ends = np.array([place[node] for node in ends], int)
         states = jnp.zeros((schedule.num_slots + 1, *self.x0.shape), self.x0.dtype)
-        states = varying_like(states.at[0].set(self.x0), self.sde, self.branches, up, noise)
+        states = varying_like(states.at[0].set(root), self.sde, self.branches, up, noise)
 
         def step(states, inputs):
             branch, plan, w, z, slot, parent_slot = inputs
@@ -389,7 +441,7 @@ class TreeProblem(eqx.Module):
             np.array(schedule.slot, int), np.array(schedule.parent_slot, int),
         )  # fmt: skip
         _, (inner_paths, inner_weights) = jax.lax.scan(step, states, inputs)
-        known = jnp.concatenate([self.x0[None], inner_paths[:, -1]])
+        known = jnp.concatenate([root[None], inner_paths[:, -1]])
         number = {0: 0} | {node: i + 1 for i, node in enumerate(inner)}
         starts = known[np.array([number[self.parents[node]] for node in ends])]
 
@@ -404,12 +456,12 @@ class TreeProblem(eqx.Module):
         end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
         paths = jnp.zeros((len(schedule.active), K + 1, *self.x0.shape), self.x0.dtype)
         paths = paths.at[at_ends].set(end_paths).at[at_inner].set(inner_paths)
-        log_weight = jnp.sum(inner_weights) + jnp.sum(end_weights)
-        return paths, log_weight + self._log_density_inside(inner_paths[:, -1])
+        log_weight = root_weight + jnp.sum(inner_weights) + jnp.sum(end_weights)
+        return paths, log_weight + self._log_density_inside(known)
 
     def _log_density_inside(self, states):
-        """Log density of what is seen at inner nodes, given their states."""
-        inner = self.schedule.inner
+        """Log density of what is seen at the root and at inner nodes, given their states."""
+        inner = (0, *self.schedule.inner)
         chosen = [i for i, node in enumerate(inner) if node in self.observed]
         if not chosen:
             return jnp.zeros((), self.x0.dtype)

@@ -18,11 +18,16 @@ A subtree is a tip whose branch is longer (Felsenstein 1973), and Σ is its erro
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from .._linalg import add, cholesky, congruence, diagonal, promote, solve_lower
 from .._types import State, Structured
 from ..conditioning import GaussianMessage, Observation
+
+
+_KEPT = 0.01
+"""The part of κ a that does not follow: rounding, of whatever precision, is less than it and so leaves a covariance."""
 
 
 class Told(NamedTuple):
@@ -90,9 +95,11 @@ def as_seen(told: Told, a: Structured, everything: bool) -> Seen:
         operator, value, whole = jnp.ones((), dtype), mean, inverse.T @ inverse
     else:
         operator, whole = R.T, eye
+    kappa = (1 - _KEPT) * kappa
     error = whole - kappa * promote(congruence(operator, a), 2, n)
-    factor = cholesky(error + _nugget(whole))
-    return Seen(Observation(operator, factor, jnp.zeros((), dtype)), value, kappa, mean)
+    found = jnp.all(jnp.isfinite(cholesky(lax.stop_gradient(error))))  # and where it does not, nothing follows
+    factor = cholesky(jnp.where(found, error, whole))
+    return Seen(Observation(operator, factor, jnp.zeros((), dtype)), value, jnp.where(found, kappa, 0.0), mean)
 
 
 def earlier(told: Told, time: Array, a: Structured) -> Told:
