@@ -21,6 +21,7 @@ from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE
 from ..trees import Tree, TreeProblem, schedule
 from ._batch import as_shape, find_batched, one_of
+from ._driving_noise import NoiseBlocks
 from ._endpoint import check_law, close_parts, names_of, seen_shape
 from ._noise_driven import AbstractNoiseDriven
 
@@ -118,6 +119,14 @@ class DiffusionTree(AbstractNoiseDriven):
         """The tree of the law."""
         return self.parts["tree"]
 
+    @property
+    def noise_blocks(self) -> NoiseBlocks:
+        """The branches that have noise, in preorder."""
+        tree = self.tree
+        branches = schedule(tree.parents, tree.observed).active
+        number = {node: i for i, node in enumerate(branches)}
+        return NoiseBlocks(tuple(number.get(tree.parents[node], -1) for node in branches))
+
     def path(self, observed):
         """Paths to `observed` that the bound noise drives, batch axes and then `(branches, num_steps + 1, n, dim)`.
 
@@ -139,6 +148,10 @@ class DiffusionTree(AbstractNoiseDriven):
     @staticmethod
     def _log_weight(parts, value, noise):
         return _problem(parts, value).log_weight(_driving(parts, noise))
+
+    @staticmethod
+    def _log_weights(parts, value, noise):
+        return _problem(parts, value).log_weights(_driving(parts, noise))
 
     @staticmethod
     def _placeholder(parts, value):

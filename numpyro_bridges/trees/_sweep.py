@@ -151,7 +151,15 @@ class TreeProblem(eqx.Module):
     def log_weight(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, ""]:
         """Ψ."""
         up = self.up()
-        return self.log_evidence(up) if self.is_exact else self.down(up, noise)[1]
+        return self.log_evidence(up) if self.is_exact else jnp.sum(self.down(up, noise)[1])
+
+    @full_precision
+    def log_weights(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, " branches"]:
+        """Ψ as a sum over the branches that have noise, in preorder: each term depends on the noise down to its end."""
+        up = self.up()
+        if self.is_exact:
+            return jnp.zeros((len(self.schedule.active),), self.x0.dtype).at[0].set(self.log_evidence(up))
+        return self.down(up, noise)[1]
 
     @full_precision
     def paths(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, "branches K+1 n *dim"]:
@@ -319,7 +327,7 @@ class TreeProblem(eqx.Module):
         return up.at_root.c  # the root's anchor is x0
 
     def down(self, up: UpwardPass, noise: Float[Array, "steps k *dim"]):
-        """States of every active node's branch `(active, K + 1, n, dim)`, and Ψ."""
+        """States of every active node's branch `(active, K + 1, n, dim)`, and its term of Ψ, `(active,)`."""
         schedule, K = self.schedule, self.num_steps
         place = {node: i for i, node in enumerate(schedule.active)}
         noise = noise.reshape(len(schedule.active), K, *noise.shape[1:])
@@ -357,22 +365,24 @@ class TreeProblem(eqx.Module):
         end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
         paths = jnp.zeros((len(schedule.active), K + 1, *self.x0.shape), self.x0.dtype)
         paths = paths.at[at_ends].set(end_paths).at[at_inner].set(inner_paths)
-        log_weight = jnp.sum(inner_weights) + jnp.sum(end_weights)
-        return paths, log_weight + self._log_density_inside(inner_paths[:, -1])
+        inner_weights = inner_weights + self._log_density_inside(inner_paths[:, -1])
+        log_weights = jnp.zeros((len(schedule.active),), self.x0.dtype)
+        return paths, log_weights.at[at_ends].set(end_weights).at[at_inner].set(inner_weights)
 
     def _log_density_inside(self, states):
-        """Log density of what is seen at inner nodes, given their states."""
+        """Log density of what is seen at inner nodes, given their states; 0 where nothing is."""
         inner = self.schedule.inner
         chosen = [i for i, node in enumerate(inner) if node in self.observed]
         if not chosen:
-            return jnp.zeros((), self.x0.dtype)
+            return jnp.zeros((len(inner),), self.x0.dtype)
 
         def one(condition, x):
             seen = condition.observation(self.sde, x)
             return condition.log_value(apply(seen.operator, x), seen.factor) + seen.log_scale
 
         rows = self._rows([inner[i] for i in chosen])
-        return jnp.sum(jax.vmap(one)(rows, states[np.array(chosen)]))
+        densities = jax.vmap(one)(rows, states[np.array(chosen)])
+        return jnp.zeros((len(inner),), self.x0.dtype).at[np.array(chosen)].set(densities)
 
 
 def _picked(tree, rows: Sequence[int]):
