@@ -475,6 +475,7 @@ def table() -> dict[str, Row]:
             coords="mapping?",
             dims="mapping?",
             noise=("flag", False),
+            nodes=("flag", True),
             paths="count?",
         ),
         "infer.fields": row(infer.fields, kernel=("kernel of MCMC", infer.FunctionSpaceHMC(model))),

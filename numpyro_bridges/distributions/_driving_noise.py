@@ -15,12 +15,14 @@ _LOG_2PI = 1.8378770664093453
 
 
 class NoiseBlocks(NamedTuple):
-    """How the first axis of the noise of a datum, its rows, is cut into blocks of equal length, one after the other.
+    """How the first axis of the noise of a datum, its rows, is cut into blocks, one after the other.
 
     The log probability is a sum over the blocks, and each term depends on the noise of its own block and of those on
     the way to it: on no other.
     """
 
+    sizes: tuple[int, ...]
+    """Rows of each block."""
     above: tuple[int, ...]
     """For each block the number of the one before it, smaller than its own, or −1."""
 

@@ -162,11 +162,10 @@ class AbstractNoiseDriven(dist.Distribution):
         """
         return self._log_prob_by(self._log_weight, (), value)
 
-    def log_prob_by_block(self, value):
+    def _log_prob_by_block(self, value):
         """Terms of `log_prob`, an axis of `noise_blocks` behind those of the batch; their sum is `log_prob`."""
         blocks = self.noise_blocks
-        if blocks is None:
-            raise ValueError(f"the noise of {type(self).__name__} is one block: use `log_prob`.")
+        assert blocks is not None
         return self._log_prob_by(self._log_weights, (len(blocks.above),), value)
 
     def _log_prob_by(self, log_weight, inner, value):

@@ -125,7 +125,31 @@ class DiffusionTree(AbstractNoiseDriven):
         tree = self.tree
         branches = schedule(tree.parents, tree.observed).active
         number = {node: i for i, node in enumerate(branches)}
-        return NoiseBlocks(tuple(number.get(tree.parents[node], -1) for node in branches))
+        sizes = (self.parts["settings"].num_steps,) * len(branches)
+        return NoiseBlocks(sizes, tuple(number.get(tree.parents[node], -1) for node in branches))
+
+    @property
+    def times(self):
+        """The times of `path`, `(branches, num_steps + 1)`; with the batch axes in front where trees have their own."""
+        if {"tree", "t0"}.isdisjoint(self._batched):
+            return _times(self.parts)
+        return self._over_batch(_times, self._full_shape)
+
+    def log_prob_by_node(self, observed):
+        """For each seen node a log likelihood of what is seen there, `(m,)` behind a batch, for leave-one-out.
+
+        With S the states that a tip s does not lead to, z_s the noise of its branch and ψ_s the branch's term of
+        `log_prob`, the joint density of parameters, states, noise and data is
+
+            p(θ, S, other data) N(z_s; 0, I) exp ψ_s(z_s, S),    ∫ N(z_s; 0, I) exp ψ_s dz_s = p(v_s | S, θ),
+
+        whatever the guide made of the noise of other branches, since they enter by their states. So the posterior mean
+        of exp(-ψ_s) is 1 / p(v_s | all other data): ψ_s is what leave-one-out asks for, and log p(v_s | S, θ) itself
+        for a linear SDE. The density given the state at the tip, log p(v_s | x_s), has the same mean, and its inverse
+        an infinite variance where the error is small beside the branch; only what is seen of a node that leads to
+        others has that, since all below depends on the state.
+        """
+        return self._log_prob_by(_by_node, (len(set(self.tree.observed)),), observed)
 
     def path(self, observed):
         """Paths to `observed` that the bound noise drives, batch axes and then `(branches, num_steps + 1, n, dim)`.
@@ -217,6 +241,21 @@ def _unled(parts, value) -> TreeProblem:
 def _driving(parts, noise):
     """Noise as the sweep takes it: a vector state has no columns."""
     return noise[..., 0] if parts["x0"].ndim == 1 else noise
+
+
+def _by_node(parts, value, noise):
+    return _problem(parts, value).log_likelihoods(_driving(parts, noise))
+
+
+def _times(parts):
+    blank = jnp.zeros((len(parts["tree"].observed), *seen_shape(_of_one_node(parts))), parts["x0"].dtype)
+    depths = parts["t0"] + parts["tree"].depths
+    return depths[np.array(parts["tree"].parents)[_active(parts)]][:, None] + _unled(parts, blank).grids
+
+
+def _active(parts):
+    """Nodes whose branches have noise."""
+    return np.array(schedule(parts["tree"].parents, parts["tree"].observed).active)
 
 
 def _paths(parts, value, noise):

@@ -28,6 +28,7 @@ import numpy as np
 from jax import Array
 
 from .._checks import choice, flag, known_number, positive_integer, require
+from ..distributions import NoiseBlocks
 from ._kernel import PROPORTION, UNSEALED, AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
@@ -82,7 +83,7 @@ class AbstractPCN(AbstractBridgeKernel):
             self._kind is None or self._num_blocks == 1,
             f"`num_blocks` cuts time steps, and `blocks` a tree; got {num_blocks} and {blocks!r}. Give one of them.",
         )
-        self._cuts: list[_Blocks] = []
+        self._cuts: list[AbstractBlocks] = []
 
     @abstractmethod
     def _evaluate(self, z: Sites, model_args, model_kwargs) -> tuple[tuple[Array, ...], Sites]:
@@ -111,7 +112,7 @@ class AbstractPCN(AbstractBridgeKernel):
         i, zero, no = jnp.array(0), jnp.zeros_like(total(energies)), jnp.array(False)
         return PCNState(i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key, UNSEALED)
 
-    def _cut(self, z) -> "list[_Blocks]":
+    def _cut(self, z) -> "list[AbstractBlocks]":
         """How the noise of each group is cut."""
         if self._kind is None:
             return [_TimeBlocks(self._num_blocks)] * len(groups_of(z, self._owners))
@@ -124,7 +125,7 @@ class AbstractPCN(AbstractBridgeKernel):
             f"`blocks` needs noise that drives one site and has no other use; {sorted(z)} are not so.",
         )
         cuts = [self._blocks[name] for name in sorted(z)]
-        return [_TimeBlocks(1) if cut is None else _TreeBlocks(cut.above, self._kind == "clade") for cut in cuts]
+        return [_TimeBlocks(1) if cut is None else _TreeBlocks(cut, self._kind == "clade") for cut in cuts]
 
     @property
     def _energies(self):
@@ -253,7 +254,7 @@ def _kicked(p, force, turns):
     return p | new, change
 
 
-class _Blocks(ABC):
+class AbstractBlocks(ABC):
     """Which noise a move turns, and what is decided; energies and angles are shaped as the decisions."""
 
     @abstractmethod
@@ -281,7 +282,7 @@ class _Blocks(ABC):
         """What belongs to an energy, for its noise."""
 
 
-class _TimeBlocks(_Blocks):
+class _TimeBlocks(AbstractBlocks):
     """Blocks of time steps, an axis of the noise `(..., num_steps, k, dim)`. Each datum is decided on its own."""
 
     def __init__(self, num_blocks: int):
@@ -310,11 +311,13 @@ class _TimeBlocks(_Blocks):
         return a.reshape(a.shape + (1,) * (noise.ndim - a.ndim))
 
 
-class _TreeBlocks(_Blocks):
-    """Branches of a tree, with an energy each, of equal parts of the axis of time steps. A move takes one level."""
+class _TreeBlocks(AbstractBlocks):
+    """Branches of a tree, with an energy each, one after the other in the time steps. A move takes one level."""
 
-    def __init__(self, above, whole_clades: bool):
+    def __init__(self, blocks: NoiseBlocks, whole_clades: bool):
+        above = blocks.above
         self._count, self._whole_clades = len(above), whole_clades
+        self._rows = np.repeat(np.arange(len(above)), blocks.sizes)
         lineages = []
         for i, parent in enumerate(above):
             lineages.append([*(lineages[parent] if parent >= 0 else []), i])
@@ -343,7 +346,7 @@ class _TreeBlocks(_Blocks):
         return padded[..., self._owner(number)]
 
     def summed(self, a, energies):
-        return jnp.sum(a.reshape(*energies.shape, -1), -1)
+        return jnp.zeros_like(energies).at[..., self._rows].add(jnp.sum(a, (-2, -1)))
 
     def widened(self, a, noise):
-        return jnp.repeat(a, noise.shape[-3] // self._count, axis=-1)[..., None, None]
+        return a[..., self._rows, None, None]

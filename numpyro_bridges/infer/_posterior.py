@@ -125,7 +125,7 @@ class _Split(Messenger):
         fn, log_prob = msg["fn"], None
         if msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
             cut = self._by_block and fn.noise_blocks is not None
-            log_prob = fn.log_prob_by_block(msg["value"]) if cut else fn.log_prob(msg["value"])
+            log_prob = fn._log_prob_by_block(msg["value"]) if cut else fn.log_prob(msg["value"])
             scale = 1.0 if msg["scale"] is None else msg["scale"]
             log_prob = jnp.asarray(scale)[..., None] * log_prob if cut else scale * log_prob
             if msg.get("_control_flow_done"):  # in a scan a noise may reach later data: one energy for all

@@ -162,6 +162,24 @@ class TreeProblem(eqx.Module):
         return self.down(up, noise)[1]
 
     @full_precision
+    def log_likelihoods(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, " seen"]:
+        """For each seen node what its datum is given its state, or, at an end, the term of its branch."""
+        place = {node: i for i, node in enumerate(self.schedule.active)}
+        at_inner = np.array([place[node] for node in self.schedule.inner], int)
+        paths, log_weights = self.down(self.up(), noise)
+        log_weights = log_weights.at[at_inner].set(self._log_density_inside(paths[at_inner, -1]))
+        return log_weights[np.array([place[node] for node in self.observed])]
+
+    @property
+    def grids(self) -> Float[Array, "branches K+1"]:
+        """Times since its start of every branch that has noise, in preorder."""
+        nodes = np.array(self.schedule.active)
+        lengths = self.branches.length[nodes - 1]
+        exact = np.isin(nodes, self.schedule.ends) & self.conditions.exact
+        graded, plain = (jax.vmap(lambda t, g=g: self._grid(t, g))(lengths) for g in (True, False))
+        return jnp.where(exact[:, None], graded, plain)
+
+    @full_precision
     def paths(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, "branches K+1 n *dim"]:
         """States along every branch that has noise, in preorder."""
         return self.down(self.up(), noise)[0]
