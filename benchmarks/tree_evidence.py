@@ -51,7 +51,7 @@ def main():
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--particles", type=int, default=48, help="of an island; half as many draws of a chain")
     parser.add_argument("--islands", type=int, default=8)
-    parser.add_argument("--moves", type=int, default=1)
+    parser.add_argument("--moves", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--progress", action="store_true")

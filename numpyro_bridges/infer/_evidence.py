@@ -135,7 +135,7 @@ def estimate_model_evidence(
     method: str = "smc",
     num_particles: int = 64,
     num_islands: int = 8,
-    num_moves: int = 2,
+    num_moves: int = 3,
     batch_size: int = 16,
     progress: bool = True,
 ) -> TemperedEvidence:

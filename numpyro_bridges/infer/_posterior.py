@@ -140,12 +140,13 @@ class _Split(Messenger):
 class _Data(Messenger):
     """Takes the data and the prior of the noise out of a model; keeps the log likelihood of all data."""
 
-    def __init__(self, fn):
+    def __init__(self, fn, latent):
         super().__init__(fn)
         self.log_likelihood = jnp.zeros(())
+        self._jacobians = {f"_{name}_log_det" for name in latent}  # factors that NumPyro adds to the priors
 
     def process_message(self, msg):
-        if msg["type"] != "sample":
+        if msg["type"] != "sample" or msg["name"] in self._jacobians:
             return
         require(
             msg["scale"] is None,
@@ -160,7 +161,7 @@ class _Data(Messenger):
 
 def prior_and_likelihood(model, model_args, model_kwargs, z: Sites) -> tuple[Array, Array]:
     """-log p(θ) of unconstrained parameters, and log p(v | θ, z) of all data."""
-    parts = _Data(model)
+    parts = _Data(model, z)
     with _AsGiven():
         prior = jnp.asarray(potential_energy(parts, model_args, model_kwargs, z))
     return prior, parts.log_likelihood
