@@ -67,10 +67,11 @@ def main():
     arguments = parser.parse_args()
     draws = 40 if arguments.quick else arguments.draws
 
-    @jax.jit
     def watched(noise):
         law = LAW.given(noise)
         return law.path(DATA)[ANCESTORS, -1], law.log_prob(DATA)
+
+    watch = jax.jit(lambda noise: jax.lax.map(watched, noise, batch_size=80))
 
     for name in arguments.kernels:
         kernel = KERNELS[name]()
@@ -89,7 +90,7 @@ def main():
             state, (noise, steps) = jax.block_until_ready(advance(state))
             seconds += time.perf_counter() - start
             count += int(np.sum(steps))
-            found.append(jax.lax.map(watched, noise.reshape(-1, *noise.shape[2:]), batch_size=80))
+            found.append(watch(noise.reshape(-1, *noise.shape[2:])))
         stacked = [[np.asarray(x).reshape(20, 4, *x.shape[1:]) for x in part] for part in zip(*found, strict=True)]
         states, log_density = (np.concatenate(part).swapaxes(0, 1) for part in stacked)
         own = ess(states)

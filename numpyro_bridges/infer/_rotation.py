@@ -35,7 +35,7 @@ def trajectory(value_and_grad, x, p, value, gradient, angle, num_steps):
         p, after = kick(p, gradient, -half)
         return x, p, gradient, value, work + total(before) + total(after)
 
-    start = x, p, gradient, value, jnp.zeros_like(half)
+    start = x, p, gradient, value, jnp.zeros_like(total(p))
     x, p, gradient, value, work = jax.lax.fori_loop(0, num_steps, leap, start)
     return x, p, value, gradient, work
 
