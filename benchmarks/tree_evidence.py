@@ -4,7 +4,7 @@ Nine simulated tips of a strongly nonlinear flow, 16 landmarks, 12 branches of 1
 tempering from the prior up by particles, and bridge sampling by chains from the posterior down. JSON lines: estimate,
 standard error, temperatures, seconds with compilation; then the difference in units of the joint standard error.
 
-    python benchmarks/tree_evidence.py                    # an hour on two cores
+    python benchmarks/tree_evidence.py                    # hours on a busy machine
     python benchmarks/tree_evidence.py --quick            # a minute: 4 steps a branch
     python benchmarks/tree_evidence.py --methods smc --repeats 4
 """
