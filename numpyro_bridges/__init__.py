@@ -28,7 +28,12 @@ from .guiding import (
     ScoreGuide as ScoreGuide,
     Unguided as Unguided,
 )
-from .infer import to_arviz as to_arviz
+from .infer import (
+    TemperedEvidence as TemperedEvidence,
+    estimate_model_evidence as estimate_model_evidence,
+    estimate_tree_evidence as estimate_tree_evidence,
+    to_arviz as to_arviz,
+)
 from .kernels import (
     AbstractKernel as AbstractKernel,
     GaussianKernel as GaussianKernel,

@@ -342,6 +342,23 @@ def table() -> dict[str, Row]:
             num_particles=("count from 2", 4),
             batch_size=("count", 4),
         ),
+        "estimate_tree_evidence": row(
+            nb.estimate_tree_evidence, True, law=("law", LAW), data=("array", X), key=("key", KEY), settings="free"
+        ),
+        "estimate_model_evidence": row(
+            nb.estimate_model_evidence,
+            True,
+            model=("function", model),
+            key=("key", KEY),
+            model_args="free",
+            model_kwargs="mapping?",
+            method=("name", "smc"),
+            num_particles=("count from 4", 4),
+            num_islands=("count from 2", 2),
+            num_moves=("count", 1),
+            batch_size=("count", 4),
+            progress=("flag", False),
+        ),
         "compare": row(
             nb.compare,
             True,
@@ -460,6 +477,7 @@ def table() -> dict[str, Row]:
             coords="mapping?",
             dims="mapping?",
             noise=("flag", False),
+            nodes=("flag", True),
             paths="count?",
         ),
         "infer.fields": row(infer.fields, kernel=("kernel of MCMC", infer.FunctionSpaceHMC(model))),
@@ -488,6 +506,7 @@ def table() -> dict[str, Row]:
                 model=("function", model),
                 num_moves=("count", 2),
                 num_blocks=("count", 1),
+                blocks="name?",
                 angle=("setting", 1.0),
                 adapt_angle=("flag", True),
                 target_accept_prob=("setting", 0.4),
@@ -810,6 +829,7 @@ EXTENSION = {
 MADE_BY_THE_LIBRARY = {
     "Alignment",
     "EvidenceEstimate",
+    "TemperedEvidence",
     "Comparison",
     "Shapes",
     "KernelCombination",

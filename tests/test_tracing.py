@@ -307,6 +307,8 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
 LEFT_OUT = {
     "Comparison": "made by `compare`",
     "EvidenceEstimate": "made by `estimate_evidence`",
+    "TemperedEvidence": "made by `estimate_tree_evidence`",
+    "NoiseBlocks": "made by laws, of integers",
     "NoiseReparam": "a handler",
     "DrivingNoise": "made by laws, from shapes",
     "GuidedStep": "a solver, without arguments",

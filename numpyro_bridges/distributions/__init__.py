@@ -1,4 +1,4 @@
-from ._driving_noise import DrivingNoise as DrivingNoise
+from ._driving_noise import DrivingNoise as DrivingNoise, NoiseBlocks as NoiseBlocks
 from ._endpoint import DiffusionEndpoint as DiffusionEndpoint
 from ._noise_driven import AbstractNoiseDriven as AbstractNoiseDriven
 from ._sample import NoiseReparam as NoiseReparam, sample as sample

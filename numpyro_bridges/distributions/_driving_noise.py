@@ -1,5 +1,7 @@
 """The standard normal noise that drives a bridge."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -10,6 +12,19 @@ from .._checks import require, require_key
 from ._batch import broadcasts
 
 _LOG_2PI = 1.8378770664093453
+
+
+class NoiseBlocks(NamedTuple):
+    """How the first axis of the noise of a datum, its rows, is cut into blocks, one after the other.
+
+    The log probability is a sum over the blocks, and each term depends on the noise of its own block and of those on
+    the way to it: on no other.
+    """
+
+    sizes: tuple[int, ...]
+    """Rows of each block."""
+    above: tuple[int, ...]
+    """For each block the number of the one before it, smaller than its own, or −1."""
 
 
 class MissingNoise(ValueError):

@@ -14,7 +14,7 @@ from numpyro.distributions import constraints
 
 from .._checks import concrete, floating, require, require_key, words
 from ._batch import as_datum, as_shape, broadcasts, map_batch, one_of, parameters, stacked
-from ._driving_noise import DrivingNoise
+from ._driving_noise import DrivingNoise, NoiseBlocks
 
 
 class AbstractNoiseDriven(dist.Distribution):
@@ -93,6 +93,11 @@ class AbstractNoiseDriven(dist.Distribution):
         raise NotImplementedError
 
     @staticmethod
+    def _log_weights(parts, value, noise):
+        """The same as a sum over `noise_blocks`."""
+        raise NotImplementedError
+
+    @staticmethod
     def _placeholder(parts, value):
         """A datum like `value` that is harmless, where the real one is masked."""
         raise NotImplementedError
@@ -114,6 +119,11 @@ class AbstractNoiseDriven(dist.Distribution):
     def noise_prior(self) -> DrivingNoise:
         """The prior of the noise, N(0, I), one noise for each datum of the batch."""
         return DrivingNoise(self.batch_shape, self.event_shape[: self._moved] + self._noise_shape)
+
+    @property
+    def noise_blocks(self) -> NoiseBlocks | None:
+        """The blocks of the noise of a datum, or `None` where it is one."""
+        return None
 
     def given(self, noise):
         """The same law with its noise bound, so that it has a `log_prob`. Leading axes of the noise widen the batch."""
@@ -150,6 +160,16 @@ class AbstractNoiseDriven(dist.Distribution):
 
         It is no density of `value` at fixed noise. Where the law is masked it is 0, whatever the value, NaN included.
         """
+        return self._log_prob_by(self._log_weight, (), value)
+
+    def _log_prob_by_block(self, value):
+        """Terms of `log_prob`, an axis of `noise_blocks` behind those of the batch; their sum is `log_prob`."""
+        blocks = self.noise_blocks
+        assert blocks is not None
+        return self._log_prob_by(self._log_weights, (len(blocks.above),), value)
+
+    def _log_prob_by(self, log_weight, inner, value):
+        """`inner`: the axes of a log weight, behind those of the batch."""
         value = as_datum(value, "value")
         self._check_value(value, "value")
         require(
@@ -159,14 +179,16 @@ class AbstractNoiseDriven(dist.Distribution):
         )
         full, mask = self._full_shape, self._mask
         if mask is not None and not np.any(concrete(mask) if concrete(mask) is not None else True):
-            return jnp.zeros(self.batch_shape)
+            return jnp.zeros(self.batch_shape + inner)
         value = jnp.broadcast_to(value, self.shape())
         if mask is not None:
             hidden = ~mask.reshape(mask.shape + (1,) * (value.ndim - mask.ndim))
             value = jnp.where(hidden, self._over_batch(self._placeholder, full, value), value)
-        log_prob: Array = self._over_batch(self._log_weight, full, value, self.noise)
-        log_prob = jnp.where(True if mask is None else mask, log_prob, 0.0)
-        return jnp.sum(log_prob, axis=tuple(range(-self._moved, 0)))
+        log_prob: Array = self._over_batch(log_weight, full, value, self.noise)
+        if mask is not None:
+            log_prob = jnp.where(mask.reshape(mask.shape + (1,) * len(inner)), log_prob, 0.0)
+        last = len(self.batch_shape)
+        return jnp.sum(log_prob, axis=tuple(range(last, last + self._moved)))
 
     def _paths_to(self, observed, one):
         """Paths of each datum by `one`, NaN where the law is masked."""

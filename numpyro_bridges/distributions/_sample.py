@@ -18,7 +18,8 @@ def sample(name: str, law: AbstractNoiseDriven, obs=None, *, infer: dict | None 
         value = numpyro.sample(name, law.given(noise), obs=obs)
 
     Inside plates every datum has its own noise. Unobserved, the site simulates. The noise in posterior draws belongs to
-    the data that were seen: leave it out of what `Predictive` is given where the number of data changes.
+    the data that were seen: leave it out of what `Predictive` is given where the number of data changes. The mark of a
+    tree's noise also holds its branches, `{"driving_noise": True, "blocks": law.noise_blocks}`.
     `handlers.scale` multiplies both log densities, as minibatches of a plate need; it does not temper the likelihood,
     since the integral of a power is no power of the integral.
 
@@ -51,9 +52,10 @@ def _with_noise(name, law, obs):
         "Wrap a law by its own methods, `law.expand`, `law.mask` and `law.to_event`, which keep the noise.",
     )
     site = f"{name}_noise"
+    mark = {"driving_noise": True} | ({} if law.noise_blocks is None else {"blocks": law.noise_blocks})
     try:
         with handlers.trace() as own:
-            noise = numpyro.sample(site, law.noise_prior(), infer={"driving_noise": True})
+            noise = numpyro.sample(site, law.noise_prior(), infer=mark)
     except MissingNoise as e:
         raise ValueError(
             f"site `{site}` has no value, and there is no random key to draw one: the draws do not hold the noise that "

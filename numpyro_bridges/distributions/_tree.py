@@ -24,6 +24,7 @@ from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE, as_covariance
 from ..trees import Root, Tree, TreeProblem, schedule
 from ._batch import as_shape, find_batched, one_of
+from ._driving_noise import NoiseBlocks
 from ._endpoint import check_law, close_parts, names_of, seen_shape
 from ._noise_driven import AbstractNoiseDriven
 
@@ -138,6 +139,41 @@ class DiffusionTree(AbstractNoiseDriven):
         """The tree of the law."""
         return self.parts["tree"]
 
+    @property
+    def noise_blocks(self) -> NoiseBlocks:
+        """The root, where it has a prior, and the branches that have noise, in preorder."""
+        tree, num_steps = self.tree, self.parts["settings"].num_steps
+        branches = schedule(tree.parents, tree.observed).active
+        root = self._noise_shape[0] - num_steps * len(branches)
+        nodes = (0, *branches) if root else branches
+        number = {node: i for i, node in enumerate(nodes)}
+        sizes = (num_steps,) * len(branches)
+        above = tuple(number.get(tree.parents[node], -1) for node in nodes)
+        return NoiseBlocks((root, *sizes) if root else sizes, above)
+
+    @property
+    def times(self):
+        """The times of `path`, `(branches, num_steps + 1)`; with the batch axes in front where trees have their own."""
+        if {"tree", "t0"}.isdisjoint(self._batched):
+            return _times(self.parts)
+        return self._over_batch(_times, self._full_shape)
+
+    def log_prob_by_node(self, observed):
+        """For each seen node a log likelihood of what is seen there, `(m,)` behind a batch, for leave-one-out.
+
+        With S the states that a tip s does not lead to, z_s the noise of its branch and ψ_s the branch's term of
+        `log_prob`, the joint density of parameters, states, noise and data is
+
+            p(θ, S, other data) N(z_s; 0, I) exp ψ_s(z_s, S),    ∫ N(z_s; 0, I) exp ψ_s dz_s = p(v_s | S, θ),
+
+        whatever the guide made of the noise of other branches, since they enter by their states. So the posterior mean
+        of exp(-ψ_s) is 1 / p(v_s | all other data): ψ_s is what leave-one-out asks for, and log p(v_s | S, θ) itself
+        for a linear SDE. The density given the state at the tip, log p(v_s | x_s), has the same mean, and its inverse
+        an infinite variance where the error is small beside the branch; only what is seen of a node that leads to
+        others has that, since all below depends on the state.
+        """
+        return self._log_prob_by(_by_node, (len(set(self.tree.observed)),), observed)
+
     def path(self, observed):
         """Paths to `observed` that the bound noise drives, batch axes and then `(branches, num_steps + 1, n, dim)`.
 
@@ -167,6 +203,10 @@ class DiffusionTree(AbstractNoiseDriven):
     @staticmethod
     def _log_weight(parts, value, noise):
         return _problem(parts, value).log_weight(_driving(parts, noise))
+
+    @staticmethod
+    def _log_weights(parts, value, noise):
+        return _problem(parts, value).log_weights(_driving(parts, noise))
 
     @staticmethod
     def _placeholder(parts, value):
@@ -268,6 +308,21 @@ def _root(parts) -> Root:
 def _driving(parts, noise):
     """Noise as the sweep takes it: a vector state has no columns."""
     return noise[..., 0] if parts["x0"].ndim == 1 else noise
+
+
+def _by_node(parts, value, noise):
+    return _problem(parts, value).log_likelihoods(_driving(parts, noise))
+
+
+def _times(parts):
+    blank = jnp.zeros((len(parts["tree"].observed), *seen_shape(_simplest(parts))), parts["x0"].dtype)
+    depths = parts["t0"] + parts["tree"].depths
+    return depths[np.array(parts["tree"].parents)[_active(parts)]][:, None] + _unled(parts, blank).grids
+
+
+def _active(parts):
+    """Nodes whose branches have noise."""
+    return np.array(schedule(parts["tree"].parents, parts["tree"].observed).active)
 
 
 def _paths(parts, value, noise):

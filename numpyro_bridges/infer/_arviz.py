@@ -3,7 +3,8 @@
 The driving noise is left out: thousands of numbers, none of them of interest. The log likelihood log p(v_i | z_i, θ) is
 conditional on it, and good for leave-one-out all the same: p(v | θ) is its mean over z ~ N(0, I), so that
 E[1/p(v_i | z_i, θ)] over the posterior of (z, θ) is E[1/p(v_i | θ)] over that of θ, the same estimand. The spread of
-the bridge's weights adds to that of the importance ratios: read Pareto k̂.
+the bridge's weights adds to that of the importance ratios: read Pareto k̂. The data of a tree are left out node by
+node, `DiffusionTree.log_prob_by_node`.
 """
 
 import warnings
@@ -17,7 +18,8 @@ from numpyro.infer import MCMC
 from numpyro.ops.provenance import eval_provenance
 
 from .._checks import flag, positive_integer, require, require_instance, require_mapping
-from ..distributions import AbstractNoiseDriven, DiffusionEndpoint
+from ..distributions import AbstractNoiseDriven, DiffusionEndpoint, DiffusionTree
+from ..trees import schedule
 from ._posterior import is_latent, is_noise, sites_of
 from ._statistics import statistics
 
@@ -30,6 +32,7 @@ def to_arviz(
     coords: dict | None = None,
     dims: dict | None = None,
     noise: bool = False,
+    nodes: bool = True,
     paths: int | None = None,
 ):
     """The result of an MCMC run, for ArviZ.
@@ -43,6 +46,7 @@ def to_arviz(
       warning says so, and flat ones then count as one chain, since theirs are not known.
     - `coords`, `dims`: as in ArviZ; plates name their axes.
     - `noise`: keep the driving noise in the posterior.
+    - `nodes`: add the states of the nodes of every observed `DiffusionTree`, of all draws whose noise was kept.
     - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all whose noise was kept;
       none by default.
 
@@ -53,12 +57,19 @@ def to_arviz(
       are sites that need what the run has not kept, such as noise dropped by `extra_fields=("~z.wing_noise",)`, and
       data masked in every draw, which say nothing: where a site has some, its seen data are one axis, `wing_seen`, and
       coordinates such as `wing_specimens` say which they are. `handlers.scale` does not enter: the value is that of one
-      datum, counted once.
+      datum, counted once. A `DiffusionTree` has one value for each seen node, on the axis `node`, for leave-one-out
+      given all other nodes.
+    - `posterior_nodes`: of each observed `DiffusionTree` the states, with axes `chain`, `draw`, the plates, `node`,
+      `point` (unless states are vectors) and `coordinate`: ancestors, and tips behind their errors. Nodes without a
+      name are `node 7`, by their number in the tree. Left out are nodes that lead to nothing seen, and those that do
+      not vary: a fixed root, tips that are seen exactly. Their R-hat and ESS are in `arviz.summary(data,
+      group="posterior_nodes")`.
     - `sample_stats`: under ArviZ's names. Those of a block of `Gibbs` have the class of its kernel in front,
       `pcn_acceptance_rate`, numbered where blocks share it, `nuts0_lp`; a draw is `diverging` if any block was.
     - `posterior_paths`: for each observed `DiffusionEndpoint` the bridges, with axes `chain`, `draw`, the plates,
       `time`, `point` (unless states are vectors) and `coordinate`. An axis in which sites differ has the site's name in
-      front, `wing_time`. Times that vary with the draws or the data are a variable, `wing_times`.
+      front, `wing_time`. Times that vary with the draws or the data are a variable, `wing_times`. A `DiffusionTree` has
+      axes `branch`, labelled by the node at its end, and `step`, and its times are a variable always.
 
     A `/` in a name, as `handlers.scope` makes them, becomes a `.`: in a `DataTree` and in a NetCDF file it would be a
     group. `dims` and `coords` may be given with either.
@@ -74,7 +85,8 @@ def to_arviz(
         ("dims", dims),
     ):
         require_mapping(groups, name)
-    noise, paths = flag(noise, "noise"), None if paths is None else positive_integer(paths, "paths")
+    noise, nodes = flag(noise, "noise"), flag(nodes, "nodes")
+    paths = None if paths is None else positive_integer(paths, "paths")
     model = getattr(mcmc.sampler, "model", None)
     require(callable(model), "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.")
     sites = sites_of(model, mcmc._args, mcmc._kwargs)
@@ -82,6 +94,7 @@ def to_arviz(
     hidden = set() if noise else {name for name, site in sites.items() if is_noise(site)}
     dims = {_plain(name): [_plain(axis) for axis in axes] for name, axes in (_plates(sites) | (dims or {})).items()}
     coords = _plainly(coords or {})
+    trees = {name: sites[name]["fn"].tree for name in observed if isinstance(sites[name]["fn"], DiffusionTree)}
     samples = mcmc.get_samples(group_by_chain=True)
     shape = next(iter(samples.values())).shape[:2]
 
@@ -94,7 +107,11 @@ def to_arviz(
         return {name: _mask_of(law) for name, (law, _) in replay(values, names).items()}
 
     def log_likelihood(values, names):
-        return {name: law.log_prob(value) for name, (law, value) in replay(values, names).items()}
+        found = replay(values, names).items()
+        return {name: law.log_prob_by_node(v) if name in trees else law.log_prob(v) for name, (law, v) in found}
+
+    def states(values, names):
+        return {name: _states(law, value) for name, (law, value) in replay(values, names).items()}
 
     def bridges(values, names):
         return {name: (law.path(value), law.times) for name, (law, value) in replay(values, names).items()}
@@ -119,14 +136,26 @@ def to_arviz(
     datasets = {}
     if known:
         found = _mapped(lambda draw: log_likelihood(lost(samples) | draw, known), samples)
-        axes = {name: _leading_axes(name, value.ndim - 2, dims) for name, value in found.items()}
-        datasets["log_likelihood"] = _seen_only(found, seen, axes, coords)
+        axes = {
+            name: _leading_axes(name, value.ndim - 2 - (name in trees), dims) for name, value in found.items()
+        }
+        own = {name: _labels(tree, dict.fromkeys(tree.observed)) for name, tree in trees.items()}
+        datasets["log_likelihood"] = _seen_only(found, seen, axes, coords, own)
+    if nodes and trees:
+        draws, driving = _with_noise(mcmc)
+        if not unknown(states, trees, driving):
+            found = _mapped(lambda draw: states(lost(driving) | draw, trees), driving)
+            leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in trees}
+            datasets["posterior_nodes"] = _of_nodes(found, leading, draws, coords, trees)
     if paths is not None:
         draws, driving = _with_noise(mcmc)
         places = np.linspace(0, len(draws) - 1, min(paths, len(draws))).astype(int)
         kept = draws[places]
-        driven = [name for name in observed if isinstance(sites[name]["fn"], DiffusionEndpoint)]
-        require(driven, f"`paths` needs an observed `DiffusionEndpoint`; the model observes {sorted(observed)}.")
+        driven = [n for n in observed if isinstance(sites[n]["fn"], (DiffusionEndpoint, DiffusionTree))]
+        require(
+            driven,
+            f"`paths` needs an observed `DiffusionEndpoint` or `DiffusionTree`; the model observes {sorted(observed)}.",
+        )
         require(
             not unknown(bridges, driven, driving),
             f"`paths` needs the noise that drives {driven}, and the run has not kept {sorted(lost(driving))}. Run it "
@@ -135,7 +164,8 @@ def to_arviz(
         )
         found = _mapped(lambda draw: bridges(lost(driving) | draw, driven), driving, places)
         leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven}
-        datasets["posterior_paths"] = _labelled(found, leading, kept, coords)
+        ends = {name: _labels(tree, _active(tree)) for name, tree in trees.items()}
+        datasets["posterior_paths"] = _labelled(found, leading, kept, coords, ends)
     groups = {
         "posterior": visible(samples),
         "sample_stats": statistics(mcmc.get_extra_fields(group_by_chain=True), mcmc.sampler),
@@ -237,16 +267,71 @@ def _without(value, mask):
     return np.where(mask, value, np.nan)
 
 
-def _seen_only(found, seen, axes, coords):
-    """A dataset of the log likelihoods of each site's data, without those that are masked."""
-    variables, labels = {}, {}
+def _states(law, observed):
+    """Of the root and of all nodes that lead to something seen, `(nodes, n, dim)` behind a batch."""
+    nodes = np.array((0, *_active(law.tree)))
+    return jnp.take(law.nodes(observed), nodes, axis=law.noise.ndim - 3)
+
+
+def _labels(tree, nodes) -> list[str]:
+    return [tree.names[node] or f"node {node}" for node in nodes]
+
+
+def _active(tree) -> tuple[int, ...]:
+    """Nodes but the root that lead to something seen, in preorder."""
+    return schedule(tree.parents, tree.observed).active
+
+
+def _axis(name, axis, labels) -> str:
+    """The name of an axis, with that of the site in front where sites differ in its labels."""
+    return axis if len({tuple(own) for own in labels.values()}) == 1 else f"{name}_{axis}"
+
+
+def _of_nodes(found, leading, draws, coords, trees):
+    """A dataset of the states of the nodes of each tree that vary."""
+    values, labels, inner = {}, {}, {}
+    for name, every in found.items():
+        number = 2 + len(leading[name])
+        before = tuple(range(number))
+        spread = np.fmax.reduce(every, axis=before) - np.fmin.reduce(every, axis=before)  # NaN where masked
+        varies = np.fmax.reduce(spread.reshape(len(spread), -1), axis=1) > 1e-6 * np.nanmax(np.abs(every))
+        own = _labels(trees[name], [0, *_active(trees[name])])
+        labels[name] = [label for label, kept in zip(own, varies, strict=True) if kept]
+        values[name] = np.compress(varies, every, axis=number)
+        inner[name] = dict(zip(("coordinate", "point"), values[name].shape[: number : -1], strict=False))
+    agree = len({tuple(sizes.items()) for sizes in inner.values()}) == 1
+    variables = {
+        name: (
+            ["chain", "draw", *leading[name], _axis(name, "node", labels)]
+            + [axis if agree else f"{name}_{axis}" for axis in reversed(inner[name])],
+            values[name],
+        )
+        for name in found
+    }
+    own = {_axis(name, "node", labels): labels[name] for name in found}
+    return _dataset(variables, coords).assign_coords(own | {"draw": _numbers(coords, draws)})
+
+
+def _numbers(coords, draws):
+    """Labels of some of the draws."""
+    return np.asarray(coords.get("draw", range(draws[-1] + 1)))[draws]
+
+
+def _seen_only(found, seen, axes, coords, nodes):
+    """A dataset of the log likelihoods of each site's data, without those that are masked.
+
+    `nodes`: labels of the last axis of some.
+    """
+    variables, labels = {}, {_axis(name, "node", nodes): own for name, own in nodes.items() if name in found}
     for name, values in found.items():
+        last = [_axis(name, "node", nodes)] if name in nodes else []
+        number = values.ndim - 2 - len(last)
         mask = seen.get(name, np.ones((), bool))
-        mask = mask.any(axis=tuple(range(values.ndim - 2, mask.ndim)))
+        mask = mask.any(axis=tuple(range(number, mask.ndim)))
         if mask.all():
-            variables[name] = (["chain", "draw", *axes[name]], values)
+            variables[name] = (["chain", "draw", *axes[name], *last], values)
         elif mask.any():
-            variables[name] = (["chain", "draw", f"{name}_seen"], values[:, :, mask])
+            variables[name] = (["chain", "draw", f"{name}_seen", *last], values[:, :, mask])
             for axis, size, places in zip(axes[name], mask.shape, np.nonzero(mask), strict=True):
                 label = axis.removeprefix(f"{name}_")
                 labels[f"{name}_{label}"] = (f"{name}_seen", np.asarray(coords.get(axis, range(size)))[places])
@@ -263,20 +348,29 @@ def _mapped(fn, samples, kept=None) -> dict:
     return jax.tree.map(lambda *parts: np.stack(parts), *done)
 
 
-def _labelled(found, leading, kept, coords):
-    """A dataset of the bridges and times of each site, with axes `(chain, draw, ..., time, point, coordinate)`."""
-    grids = {name: _grid(path[0, 0], times, len(leading[name])) for name, (path, times) in found.items()}
+def _labelled(found, leading, kept, coords, branches):
+    """A dataset of the bridges and times of each site, with axes `(chain, draw, ..., time, point, coordinate)`.
+
+    `branches`: labels of those of trees, which have the axes `branch` and `step` in place of `time`.
+    """
+    grids = {
+        name: _grid(path[0, 0], times, len(leading[name]), branches.get(name)) for name, (path, times) in found.items()
+    }
     taken = set().union(*leading.values())
 
     def label(name, axis):
         agreed = len({grid[axis] for grid in grids.values() if axis in grid}) == 1
         return axis if agreed and axis not in taken else f"{name}_{axis}"
 
-    variables, labels = {}, {"draw": np.asarray(coords.get("draw", range(kept[-1] + 1)))[kept]}
+    variables, labels = {}, {"draw": _numbers(coords, kept)}
     for name, (path, times) in found.items():
         axes = [label(name, axis) for axis in grids[name]]
         variables[name] = (["chain", "draw", *leading[name], *axes], path)
-        if isinstance(grids[name]["time"], tuple):
+        if name in branches:
+            labels[axes[0]] = branches[name]
+            own = leading[name] if times.ndim > 4 else ()
+            variables[f"{name}_times"] = (["chain", "draw", *own, *axes[:2]], times)
+        elif isinstance(grids[name]["time"], tuple):
             labels[axes[0]] = times[0, 0]
         else:
             own = leading[name] if times.ndim > 3 else ()
@@ -293,9 +387,12 @@ def _dataset(variables, coords):
     return data.assign_coords({axis: np.arange(size) for axis, size in data.sizes.items()} | given)
 
 
-def _grid(path, times, number) -> dict:
+def _grid(path, times, number, branches) -> dict:
     """What two sites with a common axis agree in: its length, and the times if they do not vary with the draws."""
-    axes = ("time", "point", "coordinate") if path.ndim - number == 3 else ("time", "coordinate")
+    first = ("time",) if branches is None else ("branch", "step")
+    axes = (*first, "point", "coordinate") if path.ndim - number == len(first) + 2 else (*first, "coordinate")
+    if branches is not None:
+        return dict(zip(axes, path.shape[number:], strict=True)) | {"branch": tuple(branches)}
     fixed = {"time": tuple(times[0, 0])} if times.ndim == 3 and np.all(times == times[0, 0]) else {}
     return dict(zip(axes, path.shape[number:], strict=True)) | fixed
 

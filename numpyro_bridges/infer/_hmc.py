@@ -22,7 +22,7 @@ from .._checks import flag, known_number, positive_integer
 from ._kernel import POSITIVE, PROPORTION, PROPORTION_OR_0, UNSEALED, AbstractBridgeKernel
 from ._posterior import Sites, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
-from ._rotation import choose, half_square, kick, metropolis, normal_like, rotate, total
+from ._rotation import choose, half_square, metropolis, normal_like, trajectory
 from ._step_size import StepSize, start_step_size, update_step_size
 
 _MAX_ENERGY_ERROR = 1000.0  # a transition above it is called divergent, as in NumPyro
@@ -142,21 +142,12 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         steps = jnp.ceil(self._length / state.adapt_state.step_size)
         steps = jnp.where(still, 1, jnp.clip(steps, 1, self._max_num_steps)).astype(int)
         turn = jr.uniform(key_length, (), y.dtype, 1 - self._jitter, 1 + self._jitter) * self._length
-        half = jnp.where(still, 0.0, 0.5 * turn / steps)
-
-        def leap(_, carry):
-            x, p, gradient, _, work = carry
-            p, before = kick(p, gradient, -half)
-            x, p = rotate(x, p, 2 * half)
-            value, gradient = jax.value_and_grad(psi)(x)
-            p, after = kick(p, gradient, -half)
-            return x, p, gradient, value, work + total(before) + total(after)
-
+        angle = jnp.where(still, 0.0, turn / steps)
         x = (y, noise)
         old = state.misfit - half_square(y)
         gradient = reference.whiten_gradient(slope) - y, force
-        start = x, normal_like(key_momentum, x), gradient, old, jnp.zeros_like(old)
-        x, p, (slope, force), new, work = jax.lax.fori_loop(0, steps, leap, start)
+        p = normal_like(key_momentum, x)
+        x, p, new, (slope, force), work = trajectory(jax.value_and_grad(psi), x, p, old, gradient, angle, steps)
         error = new - old + work
         rate, accept = metropolis(key_accept, error)
         moved = to_sites(x), new + half_square(x[0]), unravel(reference.colour_gradient(slope + x[0])) | force

@@ -22,6 +22,7 @@ from numpyro.infer.util import constrain_fn
 from numpyro.util import is_prng_key
 
 from .._checks import as_float, concrete, require, words
+from ..distributions import NoiseBlocks
 from ._posterior import (
     Sites,
     constrained,
@@ -58,6 +59,7 @@ class AbstractBridgeKernel(MCMCKernel):
         self._init_strategy = init_strategy
         self._sample_fn = None
         self._noise: tuple[str, ...] = ()
+        self._blocks: dict[str, NoiseBlocks | None] = {}
         self._owners: dict[str, str] | None = None
 
     @abstractmethod
@@ -170,6 +172,7 @@ class AbstractBridgeKernel(MCMCKernel):
         discrete = [k for k, site in sites.items() if site["fn"].support.is_discrete]
         require(not discrete, f"{name} cannot draw the discrete sites {discrete}: give them a block of `Gibbs`.")
         self._noise = tuple(sorted(k for k, site in sites.items() if is_noise(site)))
+        self._blocks = {k: sites[k]["infer"].get("blocks") for k in self._noise}
         require(
             bool(self._noise),
             f"{name} found no driving noise among the latent sites {sorted(sites)}: observe a law with "

@@ -11,18 +11,24 @@ Langevin version, also kicks p by the gradient of the log likelihood, for half o
 
 Data that are independent given the parameters, each with its own noise, move at once and are accepted one by one: one
 evaluation of the model updates them all, and each has its own angle.
+
+So do the clades of a tree, given the noise before them: Ψ is a sum over the branches, and the noise of a branch enters
+its own term and those below it. A move turns the noise of all branches of one level, those that are as many branches
+from the root, or of all that is below them too; each is accepted on what changes in its clade.
 """
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from math import pi
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import numpy as np
 from jax import Array
 
-from .._checks import flag, known_number, positive_integer, require
+from .._checks import choice, flag, known_number, positive_integer, require
+from ..distributions import NoiseBlocks
 from ._kernel import PROPORTION, UNSEALED, AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
@@ -33,7 +39,8 @@ class PCNState(NamedTuple):
 
     - `z`: the noise. `potential_energy`: minus the log joint density, up to what does not depend on the noise.
     - `energies`: -log p(v_s | θ, z_s), an array for each noise site; one number where data share noise, or where it has
-      other uses. `force`: minus their gradient, in `PCNL`.
+      other uses. With `blocks` those of a tree have an axis for its branches behind. `force`: minus their gradient, in
+      `PCNL`.
     - `angles`: φ, shaped as `energies`, adapted in the warm-up. `accept_prob`: the mean over data and moves.
     - `diverging`: an energy was NaN. `seal`: by which a chain knows that it starts again, perhaps on other data.
     """
@@ -58,6 +65,7 @@ class AbstractPCN(AbstractBridgeKernel):
         *,
         num_moves: int = 1,
         num_blocks: int = 1,
+        blocks: str | None = None,
         angle: float = 1.0,
         adapt_angle: bool = True,
         target_accept_prob: float = 0.4,
@@ -70,10 +78,19 @@ class AbstractPCN(AbstractBridgeKernel):
         self._adapt_angle = flag(adapt_angle, "adapt_angle")
         self._num_moves = positive_integer(num_moves, "num_moves")
         self._num_blocks = positive_integer(num_blocks, "num_blocks")
+        self._kind = None if blocks is None else choice(blocks, "blocks", ("branch", "clade"))
+        require(
+            self._kind is None or self._num_blocks == 1,
+            f"`num_blocks` cuts time steps, and `blocks` a tree; got {num_blocks} and {blocks!r}. Give one of them.",
+        )
+        self._cuts: list[AbstractBlocks] = []
 
     @abstractmethod
     def _evaluate(self, z: Sites, model_args, model_kwargs) -> tuple[tuple[Array, ...], Sites]:
         """Energies, and the force on the noise; an empty one, if the energies alone decide."""
+
+    def _energies_of(self, z, model_args, model_kwargs):
+        return energies_of(self._model, model_args, model_kwargs, z, self._owners, self._kind is not None)[1]
 
     def get_diagnostics_str(self, state):
         angles = jnp.concatenate([jnp.ravel(angle) for angle in state.angles])
@@ -89,10 +106,26 @@ class AbstractPCN(AbstractBridgeKernel):
         few = [name for name in z if self._num_blocks > (z[name].shape[-3] if z[name].ndim > 2 else 1)]
         require(not few, f"`num_blocks` must be at most the number of time steps; {few} have fewer.")
         self._owners = driven_by(self._model, model_args, model_kwargs, z)
+        self._cuts = self._cut(z)
         energies, force = self._evaluate(z, model_args, model_kwargs)
         angles = tuple(jnp.full_like(energy, self._angle) for energy in energies)
         i, zero, no = jnp.array(0), jnp.zeros_like(total(energies)), jnp.array(False)
         return PCNState(i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key, UNSEALED)
+
+    def _cut(self, z) -> "list[AbstractBlocks]":
+        """How the noise of each group is cut."""
+        if self._kind is None:
+            return [_TimeBlocks(self._num_blocks)] * len(groups_of(z, self._owners))
+        require(
+            any(blocks is not None for blocks in self._blocks.values()),
+            f"`blocks` needs the noise of a `DiffusionTree`, of `numpyro_bridges.sample`; {sorted(z)} have none.",
+        )
+        require(
+            self._owners is not None,
+            f"`blocks` needs noise that drives one site and has no other use; {sorted(z)} are not so.",
+        )
+        cuts = [self._blocks[name] for name in sorted(z)]
+        return [_TimeBlocks(1) if cut is None else _TreeBlocks(cut, self._kind == "clade") for cut in cuts]
 
     @property
     def _energies(self):
@@ -121,13 +154,13 @@ class AbstractPCN(AbstractBridgeKernel):
         )
 
     def _move(self, key, m, state, still, model_args, model_kwargs):
-        """Turns the noise of one block of time steps, and decides for each datum."""
+        """Turns the noise of one block of time steps, or of one level of a tree, and decides for each datum."""
         key_p, key_accept = jr.split(key)
         old, groups = state.z, groups_of(state.z, self._owners)
-        block = (state.i * self._num_moves + m) % self._num_blocks
+        number = state.i * self._num_moves + m
         turns = {
-            name: _widened(jnp.where(still, 0.0, angle), old[name]) * _inside(block, self._num_blocks, old[name])
-            for group, angle in zip(groups, state.angles, strict=True)
+            name: cut.turns(number, jnp.where(still, 0.0, angle), old[name])
+            for group, cut, angle in zip(groups, self._cuts, state.angles, strict=True)
             for name in group
         }
         p, before = _kicked(normal_like(key_p, old), state.force, turns)
@@ -135,29 +168,34 @@ class AbstractPCN(AbstractBridgeKernel):
         energies, force = self._evaluate(new, model_args, model_kwargs)
         _, after = _kicked(p, force, turns)
 
-        accept, rates = {}, []
-        for key, group, e_new, e_old in zip(
-            jr.split(key_accept, len(groups)), groups, energies, state.energies, strict=True
+        accept, decisions, rates, asked = {}, [], [], []
+        for key, group, cut, e_new, e_old in zip(
+            jr.split(key_accept, len(groups)), groups, self._cuts, energies, state.energies, strict=True
         ):
-            work = sum(_sum_to(before[name] + after[name], e_new) for name in group if name in force)
-            rate, decisions = metropolis(key, e_new - e_old + work)
-            accept |= {name: decisions | still for name in group}
-            rates.append(rate)
+            work = sum(cut.summed(before[name] + after[name], e_new) for name in group if name in force)
+            rate, decision = metropolis(key, cut.judged(number, e_new - e_old + work))
+            accepted = cut.applied(number, decision) | still
+            accept |= {name: cut.widened(accepted, old[name]) for name in group}
+            decisions.append(accepted)
+            asked.append(jnp.broadcast_to(cut.asked(number), rate.shape))
+            rates.append(jnp.where(asked[-1], rate, 0.0))
 
         def chosen(new, old):
-            return {name: jnp.where(_widened(accept[name], new[name]), new[name], old[name]) for name in new}
+            return {name: jnp.where(accept[name], new[name], old[name]) for name in new}
 
-        decisions = [accept[group[0]] for group in groups]
         state = state._replace(
             z=chosen(new, old),
             energies=jax.tree.map(jnp.where, tuple(decisions), energies, state.energies),
             force=chosen(force, state.force),
-            angles=tuple(self._adapted(state, a, r) for a, r in zip(state.angles, rates, strict=True)),
+            angles=tuple(
+                jnp.where(own, self._adapted(state, a, r), a)
+                for own, a, r in zip(asked, state.angles, rates, strict=True)
+            ),
             diverging=state.diverging | jnp.isnan(total(energies)),
         )
-        return state, total(rates) / sum(rate.size for rate in rates)
+        return state, total(rates) / total(asked)
 
-    def _adapted(self, state, angle, rate):
+    def _adapted(self, state, angle: Array, rate: Array) -> Array:
         """Robbins-Monro: the rate tends to its target, or stays above it at the largest angle, π/2."""
         if not self._adapt_angle:
             return angle
@@ -180,13 +218,15 @@ class PCN(AbstractPCN):
     - `num_moves`: moves for each draw.
     - `num_blocks`: the time steps are cut into that many blocks, of which every move turns the next. It helps where
       whole paths are hardly accepted.
+    - `blocks`: for the noise of a `DiffusionTree`. "branch": a move turns the noise of the branches of one level, as
+      many branches from the root, and every move takes the next level; each branch is accepted on what changes below
+      it, and has its own angle. "clade": all noise below them turns too. Without it the tree is accepted as a whole.
     - `angle`: φ in (0, π/2], π/2 being an independent proposal. Adapted in the warm-up, for each datum on its own, to
       `target_accept_prob`, unless `adapt_angle=False`.
     """
 
     def _evaluate(self, z, model_args, model_kwargs):
-        _, energies = energies_of(self._model, model_args, model_kwargs, z, self._owners)
-        return energies, {}
+        return self._energies_of(z, model_args, model_kwargs), {}
 
 
 class PCNL(AbstractPCN):
@@ -197,7 +237,7 @@ class PCNL(AbstractPCN):
 
     def _evaluate(self, z, model_args, model_kwargs):
         def energy(z):
-            _, energies = energies_of(self._model, model_args, model_kwargs, z, self._owners)
+            energies = self._energies_of(z, model_args, model_kwargs)
             return total(energies), energies
 
         gradient, energies = jax.grad(energy, has_aux=True)(z)
@@ -214,18 +254,99 @@ def _kicked(p, force, turns):
     return p | new, change
 
 
-def _inside(block, num_blocks, noise):
-    """1 in a block of the time steps, an axis of the noise `(..., num_steps, k, dim)`; 0 outside."""
-    if num_blocks == 1:
-        return jnp.ones((), noise.dtype)
-    steps = noise.shape[-3]
-    return (jnp.arange(steps) * num_blocks // steps == block).astype(noise.dtype)[:, None, None]
+class AbstractBlocks(ABC):
+    """Which noise a move turns, and what is decided; energies and angles are shaped as the decisions."""
+
+    @abstractmethod
+    def turns(self, number, angle, noise) -> Array:
+        """The angle of every noise in the move of this number."""
+
+    @abstractmethod
+    def asked(self, number) -> Array:
+        """Whose moves are decided."""
+
+    @abstractmethod
+    def judged(self, number, change) -> Array:
+        """What each move changes, of what each energy changes."""
+
+    @abstractmethod
+    def applied(self, number, decision) -> Array:
+        """Which energies change, of which moves are accepted."""
+
+    @abstractmethod
+    def summed(self, a, energies) -> Array:
+        """The sum over the noise of each energy."""
+
+    @abstractmethod
+    def widened(self, a, noise) -> Array:
+        """What belongs to an energy, for its noise."""
 
 
-def _widened(a, like):
-    return a.reshape(a.shape + (1,) * (like.ndim - a.ndim))
+class _TimeBlocks(AbstractBlocks):
+    """Blocks of time steps, an axis of the noise `(..., num_steps, k, dim)`. Each datum is decided on its own."""
+
+    def __init__(self, num_blocks: int):
+        self._num_blocks = num_blocks
+
+    def turns(self, number, angle, noise):
+        if self._num_blocks == 1:
+            return self.widened(angle, noise)
+        steps = noise.shape[-3]
+        inside = jnp.arange(steps) * self._num_blocks // steps == number % self._num_blocks
+        return self.widened(angle, noise) * inside.astype(noise.dtype)[:, None, None]
+
+    def asked(self, number):
+        return jnp.array(True)
+
+    def judged(self, number, change):
+        return change
+
+    def applied(self, number, decision):
+        return decision
+
+    def summed(self, a, energies):
+        return jnp.sum(a, axis=tuple(range(energies.ndim, a.ndim)))
+
+    def widened(self, a, noise):
+        return a.reshape(a.shape + (1,) * (noise.ndim - a.ndim))
 
 
-def _sum_to(a, like):
-    """The sum over the axes that `like` lacks, which are the last."""
-    return jnp.sum(a, axis=tuple(range(like.ndim, a.ndim)))
+class _TreeBlocks(AbstractBlocks):
+    """Branches of a tree, with an energy each, one after the other in the time steps. A move takes one level."""
+
+    def __init__(self, blocks: NoiseBlocks, whole_clades: bool):
+        above = blocks.above
+        self._count, self._whole_clades = len(above), whole_clades
+        self._rows = np.repeat(np.arange(len(above)), blocks.sizes)
+        lineages = []
+        for i, parent in enumerate(above):
+            lineages.append([*(lineages[parent] if parent >= 0 else []), i])
+        depth = max(map(len, lineages))
+        # for each level and branch: the branch of that level at or above it; none is the number of branches
+        self._owners = np.full((depth, len(above)), len(above))
+        for i, lineage in enumerate(lineages):
+            self._owners[: len(lineage), i] = lineage
+
+    def _owner(self, number):
+        return jnp.asarray(self._owners)[number % len(self._owners)]
+
+    def turns(self, number, angle, noise):
+        moving = self._owner(number) < self._count if self._whole_clades else self.asked(number)
+        return self.widened(jnp.where(moving, self.applied(number, angle), 0.0), noise)
+
+    def asked(self, number):
+        return self._owner(number) == jnp.arange(self._count)
+
+    def judged(self, number, change):
+        total = jnp.zeros((*change.shape[:-1], self._count + 1), change.dtype)
+        return total.at[..., self._owner(number)].add(change)[..., :-1]
+
+    def applied(self, number, decision):
+        padded = jnp.concatenate([decision, jnp.zeros_like(decision[..., :1])], -1)
+        return padded[..., self._owner(number)]
+
+    def summed(self, a, energies):
+        return jnp.zeros_like(energies).at[..., self._rows].add(jnp.sum(a, (-2, -1)))
+
+    def widened(self, a, noise):
+        return a[..., self._rows, None, None]

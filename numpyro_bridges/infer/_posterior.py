@@ -20,7 +20,7 @@ from numpyro.infer import init_to_median, init_to_sample
 from numpyro.infer.util import compute_log_probs, constrain_fn, potential_energy
 from numpyro.primitives import Messenger
 
-from .._checks import require_instance
+from .._checks import require, require_instance
 from ..distributions import AbstractNoiseDriven
 
 Sites = dict[str, Array]
@@ -115,28 +115,64 @@ class _Split(Messenger):
     What `handlers.scale` makes of the noise's prior, beyond the prior itself, stays in.
     """
 
-    def __init__(self, fn):
+    def __init__(self, fn, by_block):
         super().__init__(fn)
-        self.log_likelihood = {}
+        self.log_likelihood, self._by_block = {}, by_block
 
     def process_message(self, msg):
         if msg["type"] != "sample":
             return
         fn, log_prob = msg["fn"], None
         if msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
-            log_prob = fn.log_prob(msg["value"])
+            cut = self._by_block and fn.noise_blocks is not None
+            log_prob = fn._log_prob_by_block(msg["value"]) if cut else fn.log_prob(msg["value"])
+            scale = 1.0 if msg["scale"] is None else msg["scale"]
+            log_prob = jnp.asarray(scale)[..., None] * log_prob if cut else scale * log_prob
             if msg.get("_control_flow_done"):  # in a scan a noise may reach later data: one energy for all
                 log_prob = jnp.sum(log_prob)
-            self.log_likelihood[msg["name"]] = log_prob if msg["scale"] is None else msg["scale"] * log_prob
+            self.log_likelihood[msg["name"]] = log_prob
         if is_noise(msg) and msg["scale"] is not None:
             msg["scale"] = msg["scale"] - 1
         elif is_noise(msg) or log_prob is not None:
             msg["fn"] = _Nothing(constraints.real, fn.batch_shape, fn.event_shape)
 
 
-def split(model, model_args, model_kwargs, z: Sites) -> tuple[Array, Sites]:
-    """rest(θ), and log p(v_s | θ, z_s) of every site that noise drives, shaped as its batch."""
-    parts = _Split(model)
+class _Data(Messenger):
+    """Takes the data and the prior of the noise out of a model; keeps the log likelihood of all data."""
+
+    def __init__(self, fn, latent):
+        super().__init__(fn)
+        self.log_likelihood = jnp.zeros(())
+        self._jacobians = {f"_{name}_log_det" for name in latent}  # factors that NumPyro adds to the priors
+
+    def process_message(self, msg):
+        if msg["type"] != "sample" or msg["name"] in self._jacobians:
+            return
+        require(
+            msg["scale"] is None,
+            f"site `{msg['name']}` is scaled, by `handlers.scale` or a plate that is subsampled: the evidence is that "
+            "of all data, each counted once.",
+        )
+        if msg["is_observed"]:
+            self.log_likelihood += jnp.sum(msg["fn"].log_prob(msg["value"]))
+        if msg["is_observed"] or is_noise(msg):
+            msg["fn"] = _Nothing(constraints.real, msg["fn"].batch_shape, msg["fn"].event_shape)
+
+
+def prior_and_likelihood(model, model_args, model_kwargs, z: Sites) -> tuple[Array, Array]:
+    """-log p(θ) of unconstrained parameters, and log p(v | θ, z) of all data."""
+    parts = _Data(model, z)
+    with _AsGiven():
+        prior = jnp.asarray(potential_energy(parts, model_args, model_kwargs, z))
+    return prior, parts.log_likelihood
+
+
+def split(model, model_args, model_kwargs, z: Sites, by_block: bool = False) -> tuple[Array, Sites]:
+    """rest(θ), and log p(v_s | θ, z_s) of every site that noise drives, shaped as its batch.
+
+    `by_block`: where the noise has blocks, with an axis for their terms behind.
+    """
+    parts = _Split(model, by_block)
     with _AsGiven():
         rest = jnp.asarray(potential_energy(parts, model_args, model_kwargs, z))
     return rest, parts.log_likelihood
@@ -190,12 +226,14 @@ def misfit(model, model_args, model_kwargs, z: Sites) -> Array:
     return rest - sum(map(jnp.sum, log_likelihood.values()))
 
 
-def energies_of(model, model_args, model_kwargs, z: Sites, owners) -> tuple[Array, tuple[Array, ...]]:
+def energies_of(
+    model, model_args, model_kwargs, z: Sites, owners, by_block: bool = False
+) -> tuple[Array, tuple[Array, ...]]:
     """`rest`, and energies -log p(v_s | θ, z_s), an array for each noise; 0 and Φ where `owners` is `None`."""
     if owners is None:
         phi = misfit(model, model_args, model_kwargs, z)
         return jnp.zeros_like(phi), (phi,)
-    rest, log_likelihood = split(model, model_args, model_kwargs, z)
+    rest, log_likelihood = split(model, model_args, model_kwargs, z, by_block)
     return rest, tuple(-log_likelihood[owners[noise]] for noise in sorted(owners))
 
 

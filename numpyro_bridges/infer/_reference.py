@@ -44,7 +44,7 @@ def laplace(potential, theta: Array) -> Reference:
     if not theta.size:
         return start
     mode, inverse_hessian = _bfgs(jax.value_and_grad(potential), theta)
-    return _if_finite(Reference(mode, jnp.linalg.cholesky(inverse_hessian)), start)
+    return if_finite(Reference(mode, jnp.linalg.cholesky(inverse_hessian)), start)
 
 
 _MAX_EVALUATIONS = 100
@@ -132,7 +132,7 @@ def update_windows(windows: Windows, i: Array, num_warmup: int, theta: Array) ->
     inside = (i >= starts[0]) & (i < ends[-1])
     ends = jnp.any(i + 1 == jnp.array(ends))
     moments = choose(inside, _add(theta, windows.moments), windows.moments)
-    renewed = start_windows(_if_finite(_from_moments(*moments), windows.reference))
+    renewed = start_windows(if_finite(from_moments(*moments), windows.reference))
     return choose(ends, renewed, windows._replace(moments=moments)), ends
 
 
@@ -142,13 +142,13 @@ def _schedule(num_warmup: int):
     return cuts[:2], cuts[1:]
 
 
-def _from_moments(mean, m2, n) -> Reference:
+def from_moments(mean, m2, n) -> Reference:
     """Correlations are shrunk as if 5 more draws had none: the factor exists for any number of draws."""
     covariance = m2 / (n - 1)
     covariance = (n * covariance + 5 * jnp.diag(jnp.diag(covariance))) / (n + 5)
     return Reference(mean, jnp.linalg.cholesky(covariance))
 
 
-def _if_finite(new: Reference, old: Reference) -> Reference:
+def if_finite(new: Reference, old: Reference) -> Reference:
     good = jnp.all(jnp.isfinite(new.scale)) & jnp.all(jnp.diag(new.scale) > 0) & jnp.all(jnp.isfinite(new.mean))
     return choose(good, new, old)

@@ -1,4 +1,4 @@
-"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks by a force, and the decision to accept."""
+"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks by a force, trajectories, and the decision to accept."""
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,27 @@ def kick(p, force, time):
     time = time if jax.tree.structure(time) == jax.tree.structure(p) else jax.tree.map(lambda _: time, p)
     change = jax.tree.map(lambda p, f, t: (p + 0.5 * t * f) * t * f, p, force, time)
     return jax.tree.map(lambda p, f, t: p + t * f, p, force, time), change
+
+
+def trajectory(value_and_grad, x, p, value, gradient, angle, num_steps):
+    """Steps of kick, turn by `angle`, kick, in the field of a potential Ψ: x, p, Ψ and ∇Ψ at the end, and the work.
+
+    `value_and_grad(x)` gives ∇Ψ and, as `value`, whatever is wanted of the end. The change of ½ |x|² + ½ |p|² is the
+    work of the kicks, so that the energy's error is the change of Ψ and the work.
+    """
+    half = 0.5 * angle
+
+    def leap(_, carry):
+        x, p, gradient, _, work = carry
+        p, before = kick(p, gradient, -half)
+        x, p = rotate(x, p, angle)
+        value, gradient = value_and_grad(x)
+        p, after = kick(p, gradient, -half)
+        return x, p, gradient, value, work + total(before) + total(after)
+
+    start = x, p, gradient, value, jnp.zeros_like(total(p))
+    x, p, gradient, value, work = jax.lax.fori_loop(0, num_steps, leap, start)
+    return x, p, value, gradient, work
 
 
 def metropolis(key, error: jax.Array):

@@ -192,7 +192,40 @@ class TreeProblem(eqx.Module):
     def log_weight(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, ""]:
         """Ψ."""
         up = self.up()
-        return self.log_evidence(up) if self.is_exact else self.down(up, noise)[1]
+        return self.log_evidence(up) if self.is_exact else jnp.sum(self.down(up, noise)[1])
+
+    @full_precision
+    def log_weights(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, " blocks"]:
+        """Ψ as a sum over the root, where it varies, and the branches that have noise, in preorder.
+
+        Each term depends on the noise down to its end.
+        """
+        up = self.up()
+        if self.is_exact:
+            blocks = len(self.schedule.active) + (self.num_root_rows > 0)
+            return jnp.zeros((blocks,), self.x0.dtype).at[0].set(self.log_evidence(up))
+        return self.down(up, noise)[1]
+
+    @full_precision
+    def log_likelihoods(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, " seen"]:
+        """For each seen node what its datum is given its state, or, at an end, the term of its branch."""
+        schedule, place = self.schedule, {node: i for i, node in enumerate(self.schedule.active)}
+        at_inner = np.array([place[node] for node in schedule.inner], int)
+        paths, log_weights = self.down(self.up(), noise)
+        densities = self._log_density_inside(jnp.concatenate([paths[:1, 0], paths[at_inner, -1]]))
+        by_node = jnp.zeros((len(self.parents),), self.x0.dtype)
+        by_node = by_node.at[np.array(schedule.active)].set(log_weights[-len(schedule.active) :])
+        by_node = by_node.at[np.array((0, *schedule.inner))].set(densities)
+        return by_node[np.array(self.observed)]
+
+    @property
+    def grids(self) -> Float[Array, "branches K+1"]:
+        """Times since its start of every branch that has noise, in preorder."""
+        nodes = np.array(self.schedule.active)
+        lengths = self.branches.length[nodes - 1]
+        exact = np.isin(nodes, self.schedule.ends) & self.conditions.exact
+        graded, plain = (jax.vmap(lambda t, g=g: self._grid(t, g))(lengths) for g in (True, False))
+        return jnp.where(exact[:, None], graded, plain)
 
     @full_precision
     def paths(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, "branches K+1 n *dim"]:
@@ -416,7 +449,10 @@ class TreeProblem(eqx.Module):
         return self.root.log_evidence(up.at_root)
 
     def down(self, up: UpwardPass, noise: Float[Array, "steps k *dim"]):
-        """States of every active node's branch `(active, K + 1, n, dim)`, and Ψ."""
+        """States of every active node's branch `(active, K + 1, n, dim)`, and the terms of Ψ, one for each block.
+
+        Blocks are the branches, behind the root where it varies.
+        """
         schedule, K = self.schedule, self.num_steps
         place = {node: i for i, node in enumerate(schedule.active)}
         at_root, noise = noise[: self.num_root_rows], noise[self.num_root_rows :]
@@ -456,22 +492,27 @@ class TreeProblem(eqx.Module):
         end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
         paths = jnp.zeros((len(schedule.active), K + 1, *self.x0.shape), self.x0.dtype)
         paths = paths.at[at_ends].set(end_paths).at[at_inner].set(inner_paths)
-        log_weight = root_weight + jnp.sum(inner_weights) + jnp.sum(end_weights)
-        return paths, log_weight + self._log_density_inside(known)
+        densities = self._log_density_inside(known)
+        log_weights = jnp.zeros((len(schedule.active),), self.x0.dtype).at[at_ends].set(end_weights)
+        log_weights = log_weights.at[at_inner].set(inner_weights + densities[1:])
+        if self.num_root_rows:
+            log_weights = jnp.concatenate([root_weight[None] + densities[:1], log_weights])
+        return paths, log_weights
 
     def _log_density_inside(self, states):
-        """Log density of what is seen at the root and at inner nodes, given their states."""
+        """Log density of what is seen at the root and at inner nodes, given their states; 0 where nothing is."""
         inner = (0, *self.schedule.inner)
         chosen = [i for i, node in enumerate(inner) if node in self.observed]
         if not chosen:
-            return jnp.zeros((), self.x0.dtype)
+            return jnp.zeros((len(inner),), self.x0.dtype)
 
         def one(condition, x):
             seen = condition.observation(self.sde, x)
             return condition.log_value(apply(seen.operator, x), seen.factor) + seen.log_scale
 
         rows = self._rows([inner[i] for i in chosen])
-        return jnp.sum(jax.vmap(one)(rows, states[np.array(chosen)]))
+        densities = jax.vmap(one)(rows, states[np.array(chosen)])
+        return jnp.zeros((len(inner),), self.x0.dtype).at[np.array(chosen)].set(densities)
 
 
 def _picked(tree, rows: Sequence[int]):

@@ -25,7 +25,6 @@ from .._linalg import add, cholesky, congruence, diagonal, promote, solve_lower
 from .._types import State, Structured
 from ..conditioning import GaussianMessage, Observation
 
-
 _KEPT = 0.01
 """The part of κ a that does not follow: rounding, of whatever precision, is less than it and so leaves a covariance."""
 
