@@ -724,6 +724,18 @@ def table() -> dict[str, Row]:
             scale=("setting?", 0.1),
             closed=("flag", True),
         ),
+        "plot.tree": row(
+            plot.tree,
+            False,
+            drawn,
+            tree=("tree", TREE),
+            ax="axes?",
+            shapes=("array? with gaps", np.stack([SQUARE] * 5)),
+            draws=("array? with gaps", np.stack([SQUARE] * 5)[None]),
+            closed=("flag", True),
+            size=("setting", 0.5),
+            max_outlines=("count", 2),
+        ),
         "plot.posterior": row(
             plot.posterior,
             True,
