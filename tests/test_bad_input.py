@@ -594,6 +594,7 @@ def table() -> dict[str, Row]:
         "datasets.mosquito_wings": row(
             nb.datasets.mosquito_wings, True, num_points=("count from 3", 4), genus=("name?", "UR")
         ),
+        "datasets.mosquito_tree": row(nb.datasets.mosquito_tree),
         "datasets.ellipses": row(
             nb.datasets.ellipses,
             num_points=("count from 3", 4),
