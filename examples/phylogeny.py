@@ -3,8 +3,8 @@
 #
 # A Kunita flow runs along the branches of a tree, from the root to the species: points close together move together,
 # over a length scale ℓ, by amounts set by an amplitude α. Specimens differ from the shape of their species by
-# independent normal errors at every point, of an SD that is a parameter too. MCMC draws from the posterior of all of
-# them and of the paths along the branches, whose ends are the ancestors.
+# independent normal errors at every point, of an SD that is a parameter too. MCMC draws from the posterior of these
+# three and of the paths along the branches, whose ends are the ancestors.
 #
 #     python examples/phylogeny.py --shapes wings.tps --tree tree.nwk                      # ID= is the species
 #     python examples/phylogeny.py --shapes wings.csv --names species --tree tree.nex
@@ -12,8 +12,8 @@
 #     python examples/phylogeny.py ... --quick       # under a minute, to see that all runs
 #     python examples/phylogeny.py ... --run saved   # saved as it goes; after a kill the same line goes on from there
 #
-# Shapes come in a tps or CSV file, row i being the same place on each; names are those of the tree, in Newick or NEXUS. A
-# species without a shape is left out of the tree, a shape without its tip is an error.
+# Shapes come in a tps or CSV file, row i being the same place on each; names are those of the tree, in Newick or NEXUS.
+# A species without a shape is left out of the tree, a shape without its tip is an error; points may be missing.
 
 # %%
 import argparse
@@ -61,6 +61,11 @@ def options(description, **defaults):
     return parser
 
 
+def files(parser, required):
+    parser.add_argument("--shapes", type=Path, required=required, help="a tps or CSV file, also .gz")
+    parser.add_argument("--table", type=Path, help="a CSV file with a row for each specimen, for columns of its own")
+
+
 def settings(arguments):
     """Those of `--quick` where it was asked for."""
     if arguments.quick:
@@ -71,21 +76,22 @@ def settings(arguments):
 
 # %% [markdown]
 # ## The data
-# The tree is made one unit high: amplitudes say what happens between its root and the present. The flow starts at its
-# first split, at the mean that Brownian motion would have there given the species, by generalised least squares.
-#
-# Given their number and mean, specimens of a species that differ by independent errors say one thing more: the sum of
-# squares about the mean. So the means and this sum are all that is needed.
+# The tree is made one unit high: amplitudes say what happens between its root and the present. It sees a row for each
+# specimen of a species. The flow starts at its first split, at the mean that Brownian motion would have there given the
+# means of the species, by generalised least squares.
 
 
 # %%
 class Data(NamedTuple):
-    tree: nb.Tree  # of the species that were seen
-    means: np.ndarray  # (species, n, dim), in the order of the tips
-    counts: np.ndarray  # specimens of each species
-    scatter: float  # sum of squares about the means
-    freedom: int  # numbers in the scatter that are free
+    tree: nb.Tree  # of the species that were seen, with a row for each specimen
+    rows: np.ndarray  # (specimens, n, dim), NaN where a point is missing
+    means: dict[str, np.ndarray]  # of each species
     start: np.ndarray  # (n, dim)
+
+    @property
+    def several(self):
+        """Whether a species has several specimens, so that something is known of the variation within."""
+        return len(self.rows) > len(self.means)
 
 
 def prepare(shapes, species, tree):
@@ -101,11 +107,10 @@ def prepare(shapes, species, tree):
         raise ValueError(f"a tree needs shapes of at least two of its tips; got those of {', '.join(groups)}.")
     tree = from_first_split(tree.pruned(groups))
     tree = tree.scaled(1 / tree.height)
-    means = tree.rows({name: group.mean(axis=0) for name, group in groups.items()})
-    counts = np.array([len(groups[name]) for name in tree.observed_names])
-    scatter = sum(float(np.sum((group - group.mean(axis=0)) ** 2)) for group in groups.values())
-    freedom = int(np.sum(counts - 1)) * means[0].size
-    return Data(tree, means, counts, scatter, freedom, mean_at_root(tree, means))
+    means = {name: np.nanmean(group, axis=0) for name, group in groups.items()}
+    start = mean_at_root(tree, np.stack([means[tree.names[tip]] for tip in tree.tips]))
+    tree = tree.observing(species)
+    return Data(tree, tree.rows(shapes, names=species), means, start)
 
 
 def from_first_split(tree):
@@ -129,36 +134,37 @@ def mean_at_root(tree, rows):
     above = ancestry(tree)[list(tree.tips)]
     shared = np.max(np.where(above[:, None] & above, tree.depths, 0.0), axis=-1)
     weights = np.linalg.solve(shared + 1e-6 * np.eye(len(shared)), np.ones(len(shared)))
+    rows = np.where(np.isnan(rows), np.nanmean(rows, axis=0), rows)
     return np.tensordot(weights / weights.sum(), rows, 1)
 
 
 # %% [markdown]
 # ## The model
-# The mean of m specimens is seen with the variance of one divided by m; their sum of squares over the variance is a χ².
 # Where no species has two specimens nothing is known of the variation within, and its SD is given by `--sd`.
 
 
 # %%
-def parameters(freedom, sd):
+def parameters(several, sd):
     amplitude = numpyro.sample("amplitude", dist.LogNormal(-2.0, 1.0))
     length_scale = numpyro.sample("length_scale", dist.LogNormal(-1.0, 0.5))
-    within = numpyro.sample("within", dist.LogNormal(-4.0, 1.0)) if freedom else sd
+    within = numpyro.sample("within", dist.LogNormal(-4.0, 1.0)) if several else sd
     return amplitude, length_scale, within
 
 
 def law_of(data, num_steps, amplitude, length_scale, within):
-    space = nb.Landmarks(*data.start.shape)
+    space, seen = nb.Landmarks(*data.start.shape), np.isfinite(data.rows).all(axis=-1)
     flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale))
-    seen = jax.vmap(lambda sd: nb.InexactMatch.from_point_sd(sd, space))(within / np.sqrt(data.counts))
-    return nb.DiffusionTree(flow, data.start, seen, tree=data.tree, num_steps=num_steps, per_node=("match",))
+    if seen.all():
+        match, own = nb.InexactMatch.from_point_sd(within, space), ()
+    else:
+        match = jax.vmap(lambda points: nb.InexactMatch.from_point_sd(within, space, mask=points))(seen)
+        own = ("match",)
+    return nb.DiffusionTree(flow, data.start, match, tree=data.tree, num_steps=num_steps, per_row=own)
 
 
 def model_of(data, num_steps, sd):
-    def model(means=None, scatter=None):
-        amplitude, length_scale, within = parameters(data.freedom, sd)
-        if data.freedom:
-            numpyro.sample("scatter", dist.Gamma(data.freedom / 2, 0.5 / within**2), obs=scatter)
-        nb.sample("tips", law_of(data, num_steps, amplitude, length_scale, within), obs=means)
+    def model(rows=None):
+        nb.sample("specimens", law_of(data, num_steps, *parameters(data.several, sd)), obs=rows)
 
     return model
 
@@ -174,15 +180,15 @@ def infer(data, arguments, sd):
     run = {"num_warmup": arguments.warmup, "num_samples": arguments.samples, "num_chains": 2 if arguments.quick else 4}
     mcmc = MCMC(kernel, chain_method="vectorized", **run)
     start, key = time.perf_counter(), jr.key(arguments.seed)
-    observed, fields = (data.means, data.scatter), nb.infer.fields(kernel)
+    rows, fields = np.nan_to_num(data.rows), nb.infer.fields(kernel)
     if arguments.run is None:
-        mcmc.run(key, *observed, extra_fields=fields)
+        mcmc.run(key, rows, extra_fields=fields)
     else:
-        nb.infer.run_checkpointed(mcmc, arguments.run, key, *observed, extra_fields=fields, keep_noise=1)
+        nb.infer.run_checkpointed(mcmc, arguments.run, key, rows, extra_fields=fields, keep_noise=1)
     samples = jax.block_until_ready(mcmc.get_samples(group_by_chain=True))
     print(f"{time.perf_counter() - start:.0f} s for {run['num_chains']} chains of {arguments.warmup} + ", end="")
     print(f"{arguments.samples} draws; divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
-    prior = Predictive(parameters, num_samples=2000)(jr.key(1), data.freedom, sd)
+    prior = Predictive(parameters, num_samples=2000)(jr.key(1), data.several, sd)
     results = nb.to_arviz(mcmc, prior=prior)
     results["posterior"]["ancestor"] = ancestors(data, arguments.steps, sd, samples)
     return {name: samples[name] for name in prior}, prior, results
@@ -190,16 +196,18 @@ def infer(data, arguments, sd):
 
 def ancestors(data, num_steps, sd, samples):
     """The inner nodes but the root: a draw of the parameters and the noise is a draw of the paths, not to be redone."""
+    rows = np.nan_to_num(data.rows)
 
     def ends(draw):
         law = law_of(data, num_steps, draw["amplitude"], draw["length_scale"], draw.get("within", sd))
-        return law.given(draw["tips_noise"]).path(data.means)[:, -1]  # of the branch above each node
+        return law.given(draw["specimens_noise"]).path(rows)[:, -1]  # of the branch above each node
 
-    found = jax.jit(jax.vmap(lambda chain: jax.lax.map(ends, chain, batch_size=16)))(samples)
+    found = jax.jit(lambda samples: jax.lax.map(ends, samples))({k: np.concatenate(v) for k, v in samples.items()})
+    found = np.reshape(found, (*samples["specimens_noise"].shape[:2], *found.shape[1:]))
     inner = inner_nodes(data.tree)
     dims = ("chain", "draw", "node", "point", "coordinate")
     coords = {"node": [name_of(data.tree, node) for node in inner], "coordinate": list("xyz"[: data.start.shape[1]])}
-    return xr.DataArray(np.asarray(found)[:, :, np.array(inner) - 1], dims=dims, coords=coords)
+    return xr.DataArray(found[:, :, np.array(inner) - 1], dims=dims, coords=coords)
 
 
 def inner_nodes(tree):
@@ -225,8 +233,8 @@ def report(results, samples, prior):
 
 # %% [markdown]
 # ## What is left behind: a NetCDF file and two figures
-# Outlines of posterior draws lie around the mean of each ancestor. They hold the uncertainty in parameters and paths, not
-# that in the tree. The root is where the flow starts, and fixed.
+# Outlines of posterior draws lie around the mean of each ancestor. They hold the uncertainty in parameters and paths,
+# not that in the tree. The root is where the flow starts, and fixed.
 
 
 # %%
@@ -242,8 +250,8 @@ def save(data, samples, prior, results, arguments, name):
     draws = np.asarray(results["posterior"]["ancestor"])
     draws = draws.reshape(-1, *draws.shape[2:])
     bands = {node: drawn(draws[:, i]) for i, node in enumerate(inner_nodes(data.tree))}
-    tips = {tip: drawn(mean) for tip, mean in zip(data.tree.observed, data.means, strict=True)}
-    nb.plot.tree(data.tree, shapes=tips | {0: drawn(data.start)}, draws=bands, closed=not arguments.open)
+    means = {name: drawn(mean) for name, mean in data.means.items()}
+    nb.plot.tree(data.tree, shapes=means | {0: drawn(data.start)}, draws=bands, closed=not arguments.open)
     plt.gca().set_xlabel("time since the root, in heights of the tree")
     times = f", deviations × {arguments.magnify:g}" if arguments.magnify != 1 else ""
     plt.gcf().suptitle(f"species, ancestors and draws of them{times}", fontsize="medium")
@@ -258,10 +266,12 @@ def save(data, samples, prior, results, arguments, name):
 
 def analyse(data, arguments, name, sd=0.005):
     """From data to files."""
-    between = float(np.std(data.means - data.start))
-    within = np.sqrt(data.scatter / data.freedom) if data.freedom else sd
-    print(f"{data.counts.sum()} specimens of {len(data.counts)} species, {len(data.start)} points: SD of a ", end="")
-    print(f"coordinate between species {between:.4f}, within {within:.4f}{'' if data.freedom else ' (given)'}")
+    between = np.nanstd(list(data.means.values()) - data.start)
+    residuals = data.rows - np.stack([data.means[name] for name in data.tree.observed_names])
+    free = np.sum(np.isfinite(data.rows)) * (1 - len(data.means) / len(data.rows))
+    within = np.sqrt(np.nansum(residuals**2) / free) if data.several else sd
+    print(f"{len(data.rows)} specimens of {len(data.means)} species, {len(data.start)} points: SD of a ", end="")
+    print(f"coordinate between species {between:.4f}, within {within:.4f}{'' if data.several else ' (given)'}")
     samples, prior, results = infer(data, arguments, sd)
     report(results, samples, prior)
     save(data, samples, prior, results, arguments, name)
@@ -274,52 +284,48 @@ def analyse(data, arguments, name, sd=0.005):
 # %%
 def read(arguments):
     """Shapes `(N, n, dim)` in register, the species of each, and the tree."""
+    shapes, rows = read_shapes(arguments)
+    species = column_of(rows, arguments.names, "--names")
+    if not arguments.aligned:
+        shapes = nb.shapes.procrustes_align(shapes).shapes
+    kept = not arguments.blanks
+    return shapes, species, nb.Tree.from_newick(arguments.tree, index=arguments.index, preserve_underscores=kept)
+
+
+def read_shapes(arguments):
+    """Shapes `(N, n, dim)` as the file has them, NaN where a point is missing, and what it says of each, by column."""
     file = arguments.shapes
     tps = Path(file.stem if file.suffix == ".gz" else file.name).suffix.lower() == ".tps"
     specimens = nb.io.read_tps(file) if tps else nb.io.read_csv(file)
-    shapes = [np.concatenate([specimen.landmarks, *specimen.curves]) for specimen in specimens]
-    species = names_of(specimens, arguments)
-    sizes = sorted({len(shape) for shape in shapes})
-    if len(sizes) > 1:
-        raise ValueError(f"{file}: all shapes must have the same points; got {sizes}.")
-    shapes = np.stack(shapes)
-    whole = np.isfinite(shapes).all(axis=(1, 2))
-    if not whole.all():
-        print(f"specimens with missing points, left out: {int(np.sum(~whole))}")
-        shapes, species = shapes[whole], [name for name, good in zip(species, whole, strict=True) if good]
-    num_points = min(arguments.points, shapes.shape[1])
-    shapes = shapes[:, np.round(np.arange(num_points) * shapes.shape[1] / num_points).astype(int)]
-    if not arguments.aligned:
-        shapes = nb.shapes.procrustes_align(shapes).shapes
-    tree = nb.Tree.from_newick(arguments.tree, index=arguments.index, preserve_underscores=not arguments.blanks)
-    return shapes, species, tree
-
-
-def names_of(specimens, arguments):
-    column = arguments.names
+    rows = [{"id": specimen.id} | dict(specimen.notes) for specimen in specimens]
     if arguments.table is not None:
         opened = gzip.open if arguments.table.suffix == ".gz" else open
-        with opened(arguments.table, "rt", encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        if len(rows) != len(specimens):
-            raise ValueError(f"--table must have a row for each of {len(specimens)} specimens; got {len(rows)}.")
-    else:
-        rows = [{"id": specimen.id} | dict(specimen.notes) for specimen in specimens]
-    known = sorted(set.intersection(*(set(row) for row in rows)))
+        with opened(arguments.table, "rt", encoding="utf-8", newline="") as table:
+            rows = list(csv.DictReader(table))
+    if len(rows) != len(specimens):
+        raise ValueError(f"--table must have a row for each of {len(specimens)} specimens; got {len(rows)}.")
+    shapes = [np.concatenate([specimen.landmarks, *specimen.curves]) for specimen in specimens]
+    if len({len(shape) for shape in shapes}) > 1:
+        raise ValueError(f"{file}: all shapes must have the same points; got {sorted(set(map(len, shapes)))}.")
+    count = len(shapes[0])
+    num_points = min(arguments.points, count)
+    chosen = np.round(np.arange(num_points) * count / num_points).astype(int)
+    return np.stack(shapes)[:, chosen], rows
+
+
+def column_of(rows, column, option):
+    """What a column says of each specimen."""
+    known = [name for name in rows[0] if all(row.get(name) for row in rows)] if rows else []
     if column not in known:
-        raise ValueError(f"--names must be a column that every specimen has, one of {known}; got {column!r}.")
-    lacking = [i for i, row in enumerate(rows, 1) if not row[column]]
-    if lacking:
-        raise ValueError(f"every specimen must have a name in {column!r}; specimen {lacking[0]} has none.")
+        raise ValueError(f"{option} must be a column that every specimen has filled, one of {known}; got {column!r}.")
     return [row[column] for row in rows]
 
 
 def main():
     parser = options("Evolution of shape along a phylogeny.")
-    parser.add_argument("--shapes", type=Path, required=True, help="a tps or CSV file, also .gz")
+    files(parser, required=True)
     parser.add_argument("--tree", type=Path, required=True, help="a Newick or NEXUS file")
     parser.add_argument("--names", default="id", help="the column or key with the species, as in the tree")
-    parser.add_argument("--table", type=Path, help="a CSV file with that column, a row for each specimen")
     parser.add_argument("--index", type=int, help="which of several trees, from 0 on")
     parser.add_argument("--blanks", action="store_true", help="underscores in names of the tree are blanks")
     parser.add_argument("--aligned", action="store_true", help="shapes are in register, and are taken as they are")
