@@ -397,7 +397,7 @@ def table() -> dict[str, Row]:
             num_steps=("count", 1),
             t0=("number", 0.5),
             guide="guide?",
-            per_node="free",
+            per_row="free",
             batch_shape="shape",
             batched="names?",
             validate_args="free",

@@ -10,6 +10,7 @@ import pytest
 from numpyro.infer import MCMC, NUTS, Predictive
 from numpyro.infer.util import log_density
 from scipy import stats
+from scipy.linalg import block_diag
 
 import numpyro_bridges as nb
 from numpyro_bridges.distributions._tree import _problem, _simulated
@@ -76,7 +77,7 @@ def joint(tree, x0, data, a, noise, rate=None, shift=0.0):
 def brownian(p, tree, **settings):
     match = jax.vmap(nb.InexactMatch)(p["noise"])
     return nb.DiffusionTree(
-        nb.BrownianMotion(p["a"]), p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_node=("match",), **settings
+        nb.BrownianMotion(p["a"]), p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_row=("match",), **settings
     )
 
 
@@ -84,7 +85,7 @@ def ornstein_uhlenbeck(p, tree, **settings):
     match = jax.vmap(nb.InexactMatch)(p["noise"])
     sde = nb.LinearSDE(-p["rate"], jnp.linalg.cholesky(p["a"]), p["shift"])
     return nb.DiffusionTree(
-        sde, p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_node=("match",), **settings
+        sde, p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_row=("match",), **settings
     )
 
 
@@ -193,13 +194,111 @@ def test_masks_of_their_own():
     """Landmarks that are missing in some tips say nothing: the dense normal of what is there."""
     seen = np.random.default_rng(1).random((len(SEEN), 3)) < 0.7
     match = jax.vmap(lambda mask: nb.InexactMatch(0.1, mask=mask))(jnp.asarray(seen))
-    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, match, tree=TREE, per_node=("match",))
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, match, tree=TREE, per_row=("match",))
     found = law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
     rows = seen.ravel()
     C = np.kron(shared_times(TREE), Q) + 0.1 * np.eye(rows.size)
     r = (DATA - X0).reshape(rows.size, 2)
     truth = sum(stats.multivariate_normal(None, C[rows][:, rows]).logpdf(r[rows, c]) for c in (0, 1))
     np.testing.assert_allclose(found, truth, rtol=1e-8)
+
+
+# Several specimens.
+
+TIMES = [3, 1, 4, 1, 2, 1, 1, 2]  # rows of each node of SEEN, an inner one among them
+MANY = TREE.observing([name for name, count in zip(SEEN, TIMES, strict=True) for _ in range(count)])
+ROWS = np.random.default_rng(7).normal(size=(len(MANY.observed), 3, 2))
+OWN = np.random.default_rng(8).uniform(0.02, 0.3, len(ROWS))
+THERE = np.random.default_rng(9).random((len(ROWS), 3)) < 0.6
+THERE[:3, 0] = False  # of one species nobody has seen the first landmark
+ERROR = np.array([[0.1, 0.03, 0.0], [0.03, 0.2, -0.05], [0.0, -0.05, 0.15]])
+SOME = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 0.0]])
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["errors of their own", "one error"])
+def test_several_specimens_have_the_dense_normal(own):
+    """Value to 1e-8 and gradients to 1e-6: species share their past, specimens the state of their node."""
+    p = {"a": jnp.asarray(Q), "x0": jnp.asarray(X0), "lengths": MANY.lengths}
+    p |= {"noise": jnp.asarray(OWN if own else 0.1), "rate": jnp.asarray(0.7), "shift": jnp.asarray(0.4)}
+
+    def ours(p, data):
+        sde = nb.LinearSDE(-p["rate"], jnp.linalg.cholesky(p["a"]), p["shift"])
+        match = jax.vmap(nb.InexactMatch)(p["noise"]) if own else nb.InexactMatch(p["noise"])
+        settings = {"per_row": ("match",)} if own else {}
+        law = nb.DiffusionTree(sde, p["x0"], match, tree=MANY.with_lengths(p["lengths"]), **settings)
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data)
+
+    def truth(p, data):
+        tree = MANY.with_lengths(p["lengths"])
+        return joint(tree, p["x0"], data, p["a"], p["noise"], p["rate"], p["shift"])
+
+    found, slopes = jax.jit(jax.value_and_grad(ours, (0, 1)))(p, ROWS)
+    expected, true_slopes = jax.jit(jax.value_and_grad(truth, (0, 1)))(p, ROWS)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    np.testing.assert_allclose(slopes[1], true_slopes[1], rtol=1e-6, atol=1e-6)
+    for key in p:
+        slope, true_slope = (s[key] + s[key].T if key == "a" else s[key] for s in (slopes[0], true_slopes[0]))
+        size = 1 + np.max(np.abs(true_slope))
+        np.testing.assert_allclose(slope, true_slope, rtol=1e-6, atol=1e-6 * size, err_msg=key)
+
+
+def matches(**arrays):
+    """A match for each row."""
+    return jax.vmap(lambda arrays: nb.InexactMatch(**arrays))(jax.tree.map(jnp.asarray, arrays))
+
+
+EACH = OWN[:, None, None]
+FUSED = {
+    "masks and errors": (
+        matches(variance=OWN, mask=THERE),
+        [np.eye(3)[there] for there in THERE],
+        [error * np.eye(there.sum()) for error, there in zip(OWN, THERE, strict=True)],
+    ),
+    "one mask": (nb.InexactMatch(0.1, mask=[True, False, True]), np.eye(3)[[0, 2]], 0.1 * np.eye(2)),
+    "correlated": (nb.InexactMatch(ERROR), np.eye(3), ERROR),
+    "correlated, their own": (matches(variance=EACH * ERROR), np.eye(3), EACH * ERROR),
+    "one operator": (nb.InexactMatch(0.1, SOME), SOME, 0.1 * np.eye(2)),
+    "operators": (jax.vmap(lambda s: nb.InexactMatch(s, SOME))(jnp.asarray(OWN)), SOME, EACH * np.eye(2)),
+}
+
+
+@pytest.mark.parametrize("name", FUSED)
+def test_specimens_of_every_kind(name):
+    """The dense normal of what is seen of them."""
+    match, operators, errors = FUSED[name]
+    if not isinstance(operators, list):
+        operators = [operators] * len(ROWS)
+        errors = np.broadcast_to(errors, (len(ROWS), *errors.shape[-2:]))
+    per_row = ("match",) if match.variance.shape[:1] == (len(ROWS),) else ()
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, match, tree=MANY, per_row=per_row)
+    seen = [operator @ v for operator, v in zip(operators, ROWS, strict=True)]
+    data = ROWS if "mask" in name else np.stack(seen)
+    found = law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data)
+    L = block_diag(*operators)
+    C = L @ np.kron(shared_times(MANY), Q) @ L.T + block_diag(*errors)
+    r = np.concatenate(seen) - L @ np.tile(X0, (len(ROWS), 1))
+    truth = sum(stats.multivariate_normal(None, C).logpdf(r[:, c]) for c in (0, 1))
+    np.testing.assert_allclose(found, truth, rtol=1e-8)
+
+
+def test_specimens_of_nonlinear_processes(key):
+    """The weight of the mean, of variance σ/r, for the same noise, and a constant in closed form."""
+    few = nb.Tree.from_newick("((a:1,b:1.5)x:.5,c:2);").observing(["x", "a", "c"])
+    names, sizes = list("xxaaac"), np.array([2, 3, 1])
+    many = few.observing(names)
+    data = many.rows(ROWS[:6], names=names)
+    owner = np.repeat(np.arange(3), sizes)
+    means = np.stack([data[owner == i].mean(0) for i in range(3)])
+    match = jax.vmap(nb.InexactMatch)(jnp.asarray(0.1 / sizes))
+    one = nb.DiffusionTree(FLOW, X0, match, tree=few, num_steps=3, per_row=("match",))
+    law = nb.DiffusionTree(FLOW, X0, nb.InexactMatch(0.1), tree=many, num_steps=3)
+    z = jr.normal(key, law.noise_prior().shape())
+    errors = 0.1 / np.asarray(FLOW.space.weights)[:, None]
+    constant = stats.norm(means[owner], np.sqrt(errors)).logpdf(data).sum()
+    constant -= stats.norm(0, np.sqrt(errors / sizes[:, None, None])).logpdf(np.zeros_like(means)).sum()
+    expected = one.given(z).log_prob(means) + constant
+    np.testing.assert_allclose(law.given(z).log_prob(data), expected, rtol=1e-10)
+    np.testing.assert_allclose(law.given(z).path(data), one.given(z).path(means), atol=1e-10)
 
 
 # Nonlinear processes.
@@ -252,6 +351,7 @@ KINDS = {
     "inexact, inner node seen": (nb.InexactMatch(0.1), TREE, None),
     "exact": (nb.ExactMatch(), nb.Tree.from_newick("((a:1,b:1.5):2,(c:3,d:.5):.3,g:2):.3;"), None),
     "some points": (nb.InexactMatch(0.1, PICK := np.eye(3)[[2, 0]]), TREE, nb.FrozenGuide()),
+    "specimens": (nb.InexactMatch(0.1), MANY, None),
     "chain": (nb.InexactMatch(0.1), nb.Tree.chain([0.5, 0.7, 2.0]), None),
     "one branch": (nb.ExactMatch(), nb.Tree.star([1.2]), None),
 }
@@ -333,6 +433,14 @@ def test_prior_predictive():
     assert np.all(np.abs(values.T @ values / len(values) - truth) < 4.5 * error)
 
 
+def test_specimens_share_the_state_of_their_node():
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, nb.InexactMatch(1e-8), tree=MANY)
+    draws = law.sample(jr.key(0), (200,))
+    between = draws - draws[:, [MANY.observed.index(node) for node in MANY.observed]]
+    repeats = between[:, np.array(MANY.observed) == np.roll(MANY.observed, 1)]
+    assert repeats.std() == pytest.approx(np.sqrt(2e-8), rel=0.05) and draws.std() > 0.5
+
+
 def test_branch_lengths_have_priors():
     def clock(data):
         rates = numpyro.sample("rates", dist.LogNormal(0.0, 0.5).expand([SMALL.num_nodes - 1]).to_event(1))
@@ -364,7 +472,7 @@ def test_priors_on_everything_in_both_precisions():
         flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale), noise=nb.LandmarkNoise(1e-5))
         match = jax.vmap(lambda sd: nb.InexactMatch(sd**2, space=space))(sd)
         tree_law = nb.DiffusionTree(
-            flow, start, match, tree=tree.scaled(rates), num_steps=4, guide=guide, per_node=("match",)
+            flow, start, match, tree=tree.scaled(rates), num_steps=4, guide=guide, per_row=("match",)
         )
         nb.sample("tips", tree_law, obs=data)
 
@@ -394,11 +502,15 @@ WRONG = {
     "steps": (lambda: law(sde=sine(1.0)), "`num_steps` must be given"),
     "no steps": (lambda: law(num_steps=0), "`num_steps` must be a positive integer; got 0"),
     "inner exact": (lambda: law(match=nb.ExactMatch()), "1 of the seen nodes are no tips"),
+    "several exact": (
+        lambda: law(match=nb.ExactMatch(), tree=TREE.observing(list("aabcc"))),
+        "and 2 rows are of nodes that have one",
+    ),
     "bins": (lambda: law(match=nb.IntervalCensored([0.0])), "`match` must see a value at each node"),
-    "per_node": (lambda: law(per_node=("sde",)), "`per_node` may hold 'match'"),
+    "per_row": (lambda: law(per_row=("sde",)), "`per_row` may hold 'match'"),
     "rows of matches": (
-        lambda: law(match=jax.vmap(nb.InexactMatch)(jnp.ones(3)), per_node=("match",)),
-        "`match` is in `per_node`, so every array of it must have 8 rows",
+        lambda: law(match=jax.vmap(nb.InexactMatch)(jnp.ones(3)), per_row=("match",)),
+        "`match` is in `per_row`, so every array of it must have 8 rows",
     ),
     "data": (lambda: density(DATA[:3]), r"`value`, an observation, must have shape \(8, 3, 2\)"),
     "several trees": (lambda: density(np.stack([DATA, DATA])), "holds 2 observations.*One noise shared"),

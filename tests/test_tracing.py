@@ -52,7 +52,8 @@ PLAIN = nb.LinearSDE(-0.3, np.array([0.4, 0.3, 0.5]), space=POINTS)
 ACTUAL = nb.InexactMatch(0.05).at(SEEN)
 TREE = nb.Tree.from_newick("((a:0.5,b:0):0.3,c:1);")
 SEVERAL = np.stack([SEEN, X0, 0.5 * SEEN])
-ROWS = jax.vmap(nb.InexactMatch)(np.array([0.05, 0.1, 0.07]))
+ERRORS = np.array([0.05, 0.1, 0.07])
+ROWS = jax.vmap(nb.InexactMatch)(ERRORS)
 
 
 def noise(shape):
@@ -280,7 +281,13 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
     "DiffusionTree": (
         nb.DiffusionTree,
         {"sde": GBM, "x0": times(X0), "match": ROWS, "tree": Of(lambda t: TREE.scaled(t)), "num_steps": 2}
-        | {"t0": times(0.1), "guide": nb.RecedingGuide(0.1), "per_node": ("match",)},
+        | {"t0": times(0.1), "guide": nb.RecedingGuide(0.1), "per_row": ("match",)},
+        lambda law: observed(law, SEVERAL),
+    ),
+    "DiffusionTree, specimens": (
+        nb.DiffusionTree,
+        {"sde": PLAIN, "x0": times(X0), "match": Of(lambda t: jax.vmap(nb.InexactMatch)(t * ERRORS))}
+        | {"tree": TREE.observing(list("aab")), "per_row": ("match",)},
         lambda law: observed(law, SEVERAL),
     ),
     "DiffusionTree, batch": (

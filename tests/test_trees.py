@@ -233,6 +233,20 @@ def test_rows_by_name():
     assert np.array_equal(tree.observing(["c", "a"]).rows({"c": 1.0, "a": 2.0}), [2.0, 1.0])
 
 
+def test_several_rows_of_a_node():
+    """By name, in the order given; nodes in preorder."""
+    names, values = ["c", "a", "c", "b", "c"], np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    tree = nb.Tree.from_newick(ABC).observing(names)
+    assert tree.observed_names == ("a", "b", "c", "c", "c") and tree.scaled(2.0).observed == tree.observed
+    specimens = [io.Specimen(np.full((1, 2), value), id=name) for name, value in zip(names, values, strict=True)]
+    for rows in (
+        tree.rows(values, names=names),
+        tree.rows({"b": 4.0, "c": [1.0, 3.0, 5.0], "a": 2.0}),
+        tree.rows(specimens)[:, 0, 1],
+    ):
+        assert np.array_equal(rows, [2.0, 4.0, 1.0, 3.0, 5.0])
+
+
 def without(**changes):
     return {name: changes.get(name, shape) for name, shape in SHAPES.items()}
 
@@ -266,8 +280,12 @@ def test_rows_of_an_array():
     tree = nb.Tree.from_newick(ABC)
     with pytest.raises(ValueError, match="`names` must be one for each row of `data`, 3; got 2"):
         tree.rows(np.ones((3, 2)), names=["a", "b"])
-    with pytest.raises(ValueError, match="each name must have one row; 'a' has several"):
-        tree.rows(np.ones((3, 2)), names=["a", "a", "b"])
+    with pytest.raises(ValueError, match="have 2 rows of 'a', which the tree sees 1 times. `tree.observing"):
+        tree.rows(np.ones((4, 2)), names=["a", "a", "b", "c"])
+    with pytest.raises(ValueError, match=r"Without data: c\. Without a node: A"):
+        tree.observing(["c", "a", "a"]).rows(np.ones((3, 2)), names=["a", "A", "a"])
+    with pytest.raises(ValueError, match=r"`data\['a'\]` must have an axis of rows in front"):
+        tree.observing(["a", "a"]).rows({"a": 1.0})
     with pytest.raises(ValueError, match="the seen nodes must have names.*node 1, which leads to 1 has none"):
         nb.Tree.star([1.0, 2.0]).rows({"a": 1.0})
 

@@ -5,6 +5,7 @@ from ._base import (
     Target as Target,
 )
 from ._cylinder import CylinderSet as CylinderSet, IntervalCensored as IntervalCensored
+from ._fused import fused as fused
 from ._match import ExactMatch as ExactMatch, InexactMatch as InexactMatch
 from ._message import (
     GaussianMessage as GaussianMessage,

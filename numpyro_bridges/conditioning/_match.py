@@ -35,7 +35,7 @@ _LOG_2PI = 1.8378770664093453
 class _Seen(AbstractCondition):
     """A match at its datum."""
 
-    match: "ExactMatch | InexactMatch"
+    match: "ExactMatch | InexactMatch | _Fused"
     observed: State
     num_extra_noises: ClassVar[int] = 0
 
@@ -76,6 +76,20 @@ class _Seen(AbstractCondition):
 
     def noise_from_target(self, law_mean, law_factor, seen):
         return jnp.zeros((0, *seen.shape), seen.dtype)
+
+
+class _Fused(eqx.Module):
+    """Several inexact matches as one, known by what is seen with it."""
+
+    seen: Observation
+    exact: ClassVar[bool] = False
+
+    @property
+    def operator(self) -> Structured:
+        return self.seen.operator
+
+    def observation(self, sde: AbstractSDE, x: State) -> Observation:
+        return self.seen
 
 
 class ExactMatch(AbstractMatch):

@@ -8,6 +8,8 @@ bound, is the log weight Ψ of guided paths along all branches (`trees/_sweep.py
 A bridge is the tree with one branch, a time series is a chain.
 """
 
+from collections import Counter
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,7 +18,7 @@ import numpy as np
 
 from .._checks import as_float, positive_integer, require, require_finite, require_instance
 from .._types import RealScalar, State
-from ..conditioning import AbstractMatch
+from ..conditioning import AbstractMatch, fused
 from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE
 from ..trees import Tree, TreeProblem, schedule
@@ -29,7 +31,7 @@ class _Settings(eqx.Module):
     """What is known of a law before tracing."""
 
     num_steps: int = eqx.field(static=True)
-    per_node: tuple[str, ...] = eqx.field(static=True)
+    per_row: tuple[str, ...] = eqx.field(static=True)
 
 
 class DiffusionTree(AbstractNoiseDriven):
@@ -45,9 +47,10 @@ class DiffusionTree(AbstractNoiseDriven):
 
     - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths.
     - `x0`: the state at the root, `(n, dim)` or `(n,)`.
-    - `match`: how a node is seen, the same for all, or one for each row with `per_node=("match",)`: every array with an
-      axis `(m,)` in front, as `jax.vmap` of a constructor returns it. So each tip has an error of its own, or its own
-      `mask` of an `InexactMatch`.
+    - `match`: how a node is seen, the same for all, or one for each row of data with `per_row=("match",)`: every array
+      with an axis `(m,)` in front, as `jax.vmap` of a constructor returns it. So each row has an error of its own, or
+      its own `mask` of an `InexactMatch`. Rows of one node are independent given its state: the variance of the match
+      is then the variation within species.
     - `tree`: a `Tree`. Its lengths may be parameters.
     - `num_steps`: steps on each branch; 1 unless given where the SDE has its exact transition (`LinearSDE`,
       `BrownianMotion`).
@@ -55,14 +58,14 @@ class DiffusionTree(AbstractNoiseDriven):
     - `guide`: as for `GuidedBridge`, for every branch.
     - `batch_shape`, `batched`: several trees with parts of their own, as for `DiffusionEndpoint`.
 
-    **Shapes:** `event_shape` is `(m, ...)`, one observation for each node of `tree.observed`; data come in that order
+    **Shapes:** `event_shape` is `(m, ...)`, one observation for each entry of `tree.observed`; data come in that order
     by `tree.rows`. The noise has shape `(branches * num_steps, k, dim)`, branches in preorder, those alone that lead to
     something seen.
 
     For a linear SDE with the default guide the density does not depend on the noise: it is the likelihood.
 
-    **Errors:** `ValueError` as for `DiffusionEndpoint`, for `IntervalCensored`, for an exact match of an inner node,
-    and for a seen root.
+    **Errors:** `ValueError` as for `DiffusionEndpoint`, for `IntervalCensored`, for an exact match of an inner node
+    or of a node with several rows, and for a seen root.
     """
 
     def __init__(
@@ -75,7 +78,7 @@ class DiffusionTree(AbstractNoiseDriven):
         num_steps: int | None = None,
         t0: RealScalar = 0.0,
         guide: AbstractGuide | None = None,
-        per_node: tuple[str, ...] = (),
+        per_row: tuple[str, ...] = (),
         batch_shape: tuple[int, ...] = (),
         batched: tuple[str, ...] | None = None,
         validate_args: bool | None = None,
@@ -89,8 +92,8 @@ class DiffusionTree(AbstractNoiseDriven):
         if guide is not None:
             require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         require(0 not in tree.observed, "`tree` must not have its root among the seen nodes: `x0` is where it is.")
-        own = names_of(per_node) or ()
-        require(set(own) <= {"match"}, f"`per_node` may hold 'match'; got {per_node}.")
+        own = names_of(per_row) or ()
+        require(set(own) <= {"match"}, f"`per_row` may hold 'match'; got {per_row}.")
         require(
             num_steps is not None or sde.has_exact_transition,
             "`num_steps` must be given, for every branch: this SDE is stepped by Euler's scheme.",
@@ -147,7 +150,7 @@ class DiffusionTree(AbstractNoiseDriven):
     @staticmethod
     def _check_data(parts, values):
         """Row by row, each by its own match where they have some."""
-        own = "match" in parts["settings"].per_node
+        own = "match" in parts["settings"].per_row
         for i, row in enumerate(np.swapaxes(values, 0, 1)):
             match = jax.tree.map(lambda a, i=i: a[i], parts["match"]) if own else parts["match"]
             for value in row:
@@ -156,18 +159,18 @@ class DiffusionTree(AbstractNoiseDriven):
 
 def _of_one_node(parts):
     """The parts of the law of one node."""
-    own = parts["settings"].per_node
+    own = parts["settings"].per_row
     return {name: jax.tree.map(lambda a: a[0], part) if name in own else part for name, part in parts.items()}
 
 
 def _check(parts):
     """Raises unless the parts make one law."""
     rows = len(parts["tree"].observed)
-    for name in parts["settings"].per_node:
+    for name in parts["settings"].per_row:
         for leaf in jax.tree.leaves(parts[name]):
             require(
                 leaf.ndim > 0 and leaf.shape[0] == rows,
-                f"`{name}` is in `per_node`, so every array of it must have {rows} rows, one for each seen node; got "
+                f"`{name}` is in `per_row`, so every array of it must have {rows} rows, one for each row of data; got "
                 f"shape {leaf.shape}. Build it by `jax.vmap`.",
             )
     check_law(_of_one_node(parts))
@@ -181,6 +184,12 @@ def _check_condition(parts, datum):
     )
     if not condition.exact:
         return
+    twice = len(tree.observed) - len(set(tree.observed))
+    require(
+        not twice,
+        f"`match` must have an error where nodes have several rows, and {twice} rows are of nodes that have one "
+        "already: use an `InexactMatch`, of the variance within species.",
+    )
     inner = [node for node in tree.observed if node not in tree.tips]
     require(
         not inner,
@@ -195,10 +204,14 @@ def _problem(parts, value) -> TreeProblem:
 
 
 def _unled(parts, value) -> TreeProblem:
-    match, own = parts["match"], parts["settings"].per_node
-    conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if "match" in own else None, 0))(match, value)
-    steps = parts["settings"].num_steps
-    return TreeProblem.of(parts["sde"], parts["guide"], parts["x0"], parts["tree"], conditions, steps, parts["t0"])
+    match, sde, x0, tree = parts["match"], parts["sde"], parts["x0"], parts["tree"]
+    own, steps = "match" in parts["settings"].per_row, parts["settings"].num_steps
+    sizes = tuple(Counter(tree.observed).values())
+    if max(sizes) > 1:
+        conditions = fused(match, value, sizes, own, sde, x0)
+    else:
+        conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(match, value)
+    return TreeProblem.of(sde, parts["guide"], x0, tree, conditions, steps, parts["t0"])
 
 
 def _driving(parts, noise):
@@ -213,7 +226,7 @@ def _paths(parts, value, noise):
 def _simulated(parts, key):
     """What is seen, and the paths of the branches that lead to it."""
     key_path, key_seen = jr.split(key)
-    tree, sde, match, own = parts["tree"], parts["sde"], parts["match"], parts["settings"].per_node
+    tree, sde, match, own = parts["tree"], parts["sde"], parts["match"], parts["settings"].per_row
     blank = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(parts))), parts["x0"].dtype)
     problem = _unled(parts, blank)
     x0, branches = problem.x0, problem.schedule.active

@@ -116,7 +116,8 @@ class TreeProblem(eqx.Module):
     def of(cls, sde, guide, x0, tree: Tree, conditions: AbstractCondition, num_steps: int, t0) -> "TreeProblem":
         """With every anchor at the root: for linear processes, for simulation, and before `anchored`."""
         guide = default_guide(sde, x0) if guide is None else guide
-        walk = schedule(tree.parents, tree.observed)
+        observed = tuple(dict.fromkeys(tree.observed))
+        walk = schedule(tree.parents, observed)
         above = np.array(tree.parents[1:])
         clock = jnp.zeros_like(tree.lengths)
         if not sde.is_autonomous(x0):
@@ -124,7 +125,7 @@ class TreeProblem(eqx.Module):
 
         at_root = jnp.broadcast_to(x0, (tree.num_nodes - 1, *x0.shape))
         branches = Branch(tree.lengths, clock, at_root, at_root)
-        return cls(sde, guide, x0, branches, conditions, tree.parents, tree.observed, num_steps, walk)
+        return cls(sde, guide, x0, branches, conditions, tree.parents, observed, num_steps, walk)
 
     def anchored(self, t0) -> "TreeProblem":
         """With anchors where a Brownian motion would be, given the data; a linear process needs none."""
@@ -132,7 +133,7 @@ class TreeProblem(eqx.Module):
             return self
         a = self.sde.covariance(t0, self.x0)
         variance = jnp.mean(jnp.diagonal(a)) if a.ndim == 2 else jnp.mean(a)
-        walker = BrownianMotion(jnp.where(variance > 0, variance, 1.0))
+        walker = BrownianMotion(jnp.where(variance > 0, variance, 1.0), space=self.sde.space)
         rough = replace(self, sde=walker, guide=FrozenGuide(), num_steps=1)
         active = np.array(self.schedule.active)
         still = jnp.zeros((len(active), *self.x0.shape), self.x0.dtype)

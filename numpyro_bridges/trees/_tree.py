@@ -37,8 +37,8 @@ class Tree(eqx.Module):
       an array leaf, so that a prior on branch lengths or a clock is ordinary NumPyro: `tree.scaled(rates)`,
       `tree.with_lengths(lengths)`.
     - `names`: for each node its name, or `None`.
-    - `observed`: numbers of the nodes that are seen, in preorder, one row of data for each: the tips unless said
-      otherwise, see `observing`.
+    - `observed`: numbers of the nodes that are seen, in preorder, one for each row of data: the tips unless said
+      otherwise, see `observing`. A node of which there are several specimens is there as often.
 
     Made by `from_newick`, `from_parents`, `chain` and `star`.
     """
@@ -271,7 +271,8 @@ class Tree(eqx.Module):
     def observing(self, names: Iterable[str]) -> "Tree":
         """The same tree of which the nodes of these names are seen, tips, inner nodes or fossils.
 
-        What is not seen costs nothing and says nothing: a tip without data need not be pruned.
+        What is not seen costs nothing and says nothing: a tip without data need not be pruned. A name that is given
+        several times is a node of which there are as many rows of data, such as specimens of a species.
         """
         return Tree(self.parents, self.lengths, self.names, [self._number(name) for name in _several(names)])
 
@@ -306,12 +307,14 @@ class Tree(eqx.Module):
     ) -> np.ndarray:
         """Data in the order of the rows of `obs=`, `(len(observed), ...)`, matched by name.
 
-        **Arguments:** `data`: arrays by name, or `Specimen`s, by their `id`; or an array `(m, ...)` with its `names`.
+        Rows of one node keep the order in which they were given.
+
+        **Arguments:** `data`: `Specimen`s, by their `id`, or an array `(m, ...)` with its `names`; or arrays by name,
+        that of a node with several rows having an axis of them in front.
 
         **Errors:** `ValueError` that lists the seen nodes without data, the data without a node and near spellings, and
-        for shapes that differ.
+        for other numbers of rows than `observed` has, and shapes that differ.
         """
-        rows = _by_name(data, names)
         unnamed = [node for node in self.observed if self.names[node] is None]
         require(
             not unnamed,
@@ -319,14 +322,22 @@ class Tree(eqx.Module):
             f"{self._in_words(unnamed[0]) if unnamed else ''} has none. Give the tree `names`, or arrange the rows by "
             "`tree.observed` yourself.",
         )
-        seen = [name for name in self.observed_names if name is not None]
-        require(set(rows) == set(seen), _difference(seen, list(rows)))
-        values = [known_float(rows[name], f"data['{name}']") for name in seen]
-        odd = [name for name, value in zip(seen, values, strict=True) if value.shape != values[0].shape]
+        seen = Counter(name for name in self.observed_names if name is not None)
+        rows = _by_name(data, names, seen)
+        require(set(rows) == set(seen), _difference(list(seen), list(rows)))
+        for name, count in seen.items():
+            require(
+                len(rows[name]) == count,
+                f"the data have {len(rows[name])} rows of {name!r}, which the tree sees {count} times. "
+                "`tree.observing(names)`, with a name for each row, makes several rows of a node; or average them.",
+            )
+        named = [(name, known_float(row, f"data['{name}']")) for name in seen for row in rows[name]]
+        values = [value for _, value in named]
+        odd = [(name, value.shape) for name, value in named if value.shape != values[0].shape]
         require(
             not odd,
-            f"`data` must have one shape; {seen[0]!r} has {values[0].shape} and "
-            f"{odd[0] if odd else ''!r} has {np.shape(rows[odd[0]]) if odd else ''}.",
+            f"`data` must have one shape; {named[0][0]!r} has {values[0].shape} and "
+            f"{odd[0][0] if odd else ''!r} has {odd[0][1] if odd else ''}.",
         )
         return np.stack(values)
 
@@ -404,7 +415,7 @@ def _as_observed(observed: Sequence[int], count: int) -> tuple[int, ...]:
         good and bool(np.all((numbers == np.round(numbers)) & (numbers >= 0) & (numbers < count))),
         f"`observed` must be numbers of nodes, from 0 to {count - 1}; got {words(observed)}.",
     )
-    return tuple(int(i) for i in np.unique(numbers))
+    return tuple(int(i) for i in np.sort(numbers))
 
 
 def _several(names: Iterable[str]) -> list[str]:
@@ -415,10 +426,11 @@ def _several(names: Iterable[str]) -> list[str]:
     return own
 
 
-def _by_name(data, names) -> dict[str, ArrayLike]:
+def _by_name(data, names, seen: Counter[str]) -> dict[str, list]:
+    """The rows of each name."""
     if isinstance(data, Mapping):
         require(names is None, "`names` belong to an array; `data` is a mapping by name.")
-        return dict(data)
+        return {name: _rows_of(data[name], name) if seen[name] > 1 else [data[name]] for name in data}
     if names is None:
         specimens = list(data) if isinstance(data, Iterable) else []
         for i, specimen in enumerate(specimens):
@@ -434,13 +446,20 @@ def _by_name(data, names) -> dict[str, ArrayLike]:
         len(names) == len(data),
         f"`names` must be one for each row of `data`, {len(data)}; got {len(names)}.",
     )
-    twice = [name for name, number in Counter(names).items() if number > 1]
+    rows: dict[str, list] = {}
+    for name, row in zip(names, data, strict=True):
+        rows.setdefault(name, []).append(row)
+    return rows
+
+
+def _rows_of(value, name: str) -> list:
+    array = known_float(value, f"data['{name}']")
     require(
-        not twice,
-        f"each name must have one row; {', '.join(map(repr, twice[:5]))} has several. Average them, or give each "
-        "specimen a tip of its own.",
+        array.ndim > 0,
+        f"`data['{name}']` must have an axis of rows in front, since the tree sees this node several times; got "
+        f"{words(value)}.",
     )
-    return dict(zip(names, data, strict=True))
+    return list(array)
 
 
 def _difference(seen: list[str], given: list[str]) -> str:
