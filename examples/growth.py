@@ -80,7 +80,8 @@ def simulated():
 # %% [markdown]
 # ## The model
 # The noise is that of a Kunita flow, frozen at the mean shape of the first age. The data say more of the shape at the
-# last age than of the adult one, which lies beyond; so the former is the parameter, and the latter follows from it.
+# last age than of the adult one, which lies beyond; so the former is the parameter, and the latter follows from it. Its
+# prior is as wide as the animals differ at that age.
 #
 # The SDE is linear, so that the density of what is seen does not depend on the noise that drives the paths: it is given
 # some, and only parameters are sampled, by NUTS.
@@ -95,7 +96,7 @@ def law_of(start, tree, mean, adult, mask, rate, amplitude, length_scale, error)
     if mask is not None:
         match, own = jax.vmap(jax.vmap(lambda seen: nb.InexactMatch(error**2, mask=seen)))(mask), ("match",)
     batch = {"batch_shape": start.shape[:1], "batched": ("x0", *own)}
-    return nb.DiffusionTree(growth, start, match, tree=tree, per_node=own, **batch)
+    return nb.DiffusionTree(growth, start, match, tree=tree, per_row=own, **batch)
 
 
 try:
@@ -106,7 +107,8 @@ span = float(ages[-1] - ages[0])
 tree = nb.Tree.chain((ages[1:] - ages[0]) / span, names=[f"{age:g}" for age in ages[1:]])
 start, later = rows[:, 0], np.nan_to_num(rows[:, 1:])
 mask = np.isfinite(rows[:, 1:]).all(axis=-1)
-mean = start.mean(axis=0)
+mean, centre = start.mean(axis=0), np.nanmean(rows[:, -1], axis=0)
+spread = np.sqrt(np.nanmean((rows[:, -1] - centre) ** 2))
 print(f"{len(rows)} animals, {len(ages)} ages from {ages[0]:g} to {ages[-1]:g}, {len(mean)} points;", end=" ")
 print(f"not seen: {int(np.sum(~mask.all(axis=-1)))} of {mask[..., 0].size}")
 
@@ -121,7 +123,7 @@ def parameters():
 
 def model(later=None):
     drawn = parameters()
-    last = numpyro.sample("last", dist.Normal(mean, 1.0).to_event(2))
+    last = centre + spread * numpyro.sample("offset", dist.Normal(jnp.zeros(mean.shape), 1.0).to_event(2))
     adult = numpyro.deterministic("adult", mean + (last - mean) / -jnp.expm1(-drawn["rate"]))
     with numpyro.plate("animal", len(start)):
         numpyro.sample("series", given(law_of(start, tree, mean, adult, mask, **drawn)), obs=later)
@@ -167,7 +169,7 @@ if arguments.shapes is None:
 
 # %%
 def shapes_of(draw, key):
-    law = law_of(start, tree, mean, draw["adult"], mask, *(draw[name] for name in prior))
+    law = law_of(start, tree, mean, draw["adult"], mask, **{name: draw[name] for name in prior})
     return given(law, key).path(later)[fewest, :, -1]
 
 
@@ -180,7 +182,7 @@ written = [arguments.output / file for file in ("growth.nc", "growth_series.png"
 results.to_netcdf(str(written[0]), engine="h5netcdf")
 
 bands = {node: found[:, node - 1, :, :2] for node in tree.observed}
-nb.plot.tree(tree, shapes={0: start[fewest, :, :2]}, draws=bands, closed=not arguments.open, size=0.9)
+nb.plot.tree(tree, shapes={0: start[fewest, :, :2]}, draws=bands, closed=not arguments.open, size=0.8)
 plt.gca().set_xlabel(f"time since the first age, in units of {span:g}")
 plt.gcf().suptitle("one animal: its first shape, and draws of the later ones", fontsize="medium")
 plt.savefig(written[1], dpi=150)
