@@ -383,6 +383,24 @@ def test_the_way_back_to_the_noise(name, key):
         np.testing.assert_allclose(ends, seen, atol=1e-12)
 
 
+@pytest.mark.parametrize("columns", [(), (2,)], ids=["vectors", "columns"])
+def test_states_of_all_nodes(columns, key):
+    """Ends of the branches in the tree's order; NaN where a node leads to nothing seen, and where the law is masked."""
+    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0[(..., *(0,) * (1 - len(columns)))], nb.InexactMatch(0.1), tree=TREE)
+    data = DATA[(..., *(0,) * (1 - len(columns)))]
+    law = law.expand((2,)).given(jr.normal(key, law.expand((2,)).noise_prior().shape()))
+    data = np.stack([data, data + 1])
+    states, paths = law.nodes(data), law.path(data)
+    assert states.shape == (2, TREE.num_nodes, 3, *columns)
+    active = schedule(TREE.parents, TREE.observed).active
+    np.testing.assert_array_equal(states[:, np.array(active)], paths[:, :, -1])
+    np.testing.assert_array_equal(states[0, 0], law.parts["x0"])
+    unseen = sorted(set(range(TREE.num_nodes)) - {0, *active})
+    assert [TREE.names[node] for node in unseen] == [None, "u"] and np.all(np.isnan(states[:, np.array(unseen)]))
+    masked = law.mask(np.array([True, False])).nodes(data)
+    assert np.all(np.isnan(masked[1])) and np.array_equal(masked[0], states[0], equal_nan=True)
+
+
 def test_one_branch_is_an_endpoint(key):
     """The same weight and path for the same noise."""
     endpoint = nb.DiffusionEndpoint(FLOW, X0, nb.InexactMatch(0.1), t1=1.2, num_steps=3)

@@ -129,6 +129,14 @@ class DiffusionTree(AbstractNoiseDriven):
         """
         return self._paths_to(observed, _paths)
 
+    def nodes(self, observed):
+        """States of all nodes of the tree, given `observed` and the bound noise: ancestors among them.
+
+        Batch axes and then `(num_nodes, n, dim)`, `(num_nodes, n)` for vector states, in the order of `tree.names`: the
+        root first, node i at i. Nodes that lead to nothing seen have no noise and are NaN, all where the law is masked.
+        """
+        return self._paths_to(observed, _nodes)
+
     @staticmethod
     def _observe(parts, key):
         return _simulated(parts, key)[0]
@@ -221,6 +229,11 @@ def _driving(parts, noise):
 
 def _paths(parts, value, noise):
     return _problem(parts, value).paths(_driving(parts, noise))
+
+
+def _nodes(parts, value, noise):
+    problem = _problem(parts, value)
+    return problem.at_nodes(problem.paths(_driving(parts, noise)))
 
 
 def _simulated(parts, key):

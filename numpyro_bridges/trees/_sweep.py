@@ -159,6 +159,12 @@ class TreeProblem(eqx.Module):
         """States along every branch that has noise, in preorder."""
         return self.down(self.up(), noise)[0]
 
+    def at_nodes(self, paths: Float[Array, "branches K+1 n *dim"]) -> Float[Array, "nodes n *dim"]:
+        """The states of all nodes, from those along the branches; NaN for nodes that lead to nothing seen."""
+        states = jnp.full((len(self.parents), *self.x0.shape), jnp.nan, paths.dtype)
+        root = paths[0, 0]  # the first branch, in preorder, starts there
+        return states.at[np.array(self.schedule.active)].set(paths[:, -1]).at[0].set(root)
+
     @full_precision
     def noise_from_paths(self, paths, key: PRNGKeyArray) -> Float[Array, "steps k *dim"]:
         """The noise with `paths(noise) = paths`; what they leave free of it is drawn with the key."""
