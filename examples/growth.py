@@ -170,7 +170,7 @@ if arguments.shapes is None:
 # %%
 def shapes_of(draw, key):
     law = law_of(start, tree, mean, draw["adult"], mask, **{name: draw[name] for name in prior})
-    return given(law, key).path(later)[fewest, :, -1]
+    return given(law, key).nodes(later)[fewest]
 
 
 fewest = int(np.argmin(mask.all(axis=-1).sum(axis=1)))
@@ -181,7 +181,7 @@ arguments.output.mkdir(parents=True, exist_ok=True)
 written = [arguments.output / file for file in ("growth.nc", "growth_series.png", "growth_posterior.png")]
 results.to_netcdf(str(written[0]), engine="h5netcdf")
 
-bands = {node: found[:, node - 1, :, :2] for node in tree.observed}
+bands = {node: found[:, node, :, :2] for node in tree.observed}
 nb.plot.tree(tree, shapes={0: start[fewest, :, :2]}, draws=bands, closed=not arguments.open, size=0.8)
 plt.gca().set_xlabel(f"time since the first age, in units of {span:g}")
 plt.gcf().suptitle("one animal: its first shape, and draws of the later ones", fontsize="medium")

@@ -196,18 +196,18 @@ def infer(data, arguments, sd):
 
 def ancestors(data, num_steps, sd, samples):
     """The inner nodes but the root: a draw of the parameters and the noise is a draw of the paths, not to be redone."""
-    rows = np.nan_to_num(data.rows)
+    rows, inner = np.nan_to_num(data.rows), inner_nodes(data.tree)
 
-    def ends(draw):
+    def states(draw):
         law = law_of(data, num_steps, draw["amplitude"], draw["length_scale"], draw.get("within", sd))
-        return law.given(draw["specimens_noise"]).path(rows)[:, -1]  # of the branch above each node
+        return law.given(draw["specimens_noise"]).nodes(rows)[np.array(inner)]
 
-    found = jax.jit(lambda samples: jax.lax.map(ends, samples))({k: np.concatenate(v) for k, v in samples.items()})
-    found = np.reshape(found, (*samples["specimens_noise"].shape[:2], *found.shape[1:]))
-    inner = inner_nodes(data.tree)
+    shape = samples["specimens_noise"].shape[:2]
+    draws = {name: np.concatenate(values) for name, values in samples.items()}
+    found = jax.jit(lambda draws: jax.lax.map(states, draws))(draws)
     dims = ("chain", "draw", "node", "point", "coordinate")
     coords = {"node": [name_of(data.tree, node) for node in inner], "coordinate": list("xyz"[: data.start.shape[1]])}
-    return xr.DataArray(found[:, :, np.array(inner) - 1], dims=dims, coords=coords)
+    return xr.DataArray(np.reshape(found, (*shape, *found.shape[1:])), dims=dims, coords=coords)
 
 
 def inner_nodes(tree):
