@@ -54,7 +54,7 @@ def options(description, **defaults):
     parser.add_argument("--samples", type=int, default=400)
     parser.add_argument("--run", type=Path, help="a directory to save the run in as it goes, and to go on from")
     parser.add_argument("--magnify", type=float, default=1.0, help="deviations from the start in the drawing")
-    parser.add_argument("--open", action="store_true", help="draw curves whose ends do not meet")
+    parser.add_argument("--open", action="store_true", help="curves whose ends do not meet")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("output"))
     parser.set_defaults(**defaults)
@@ -251,7 +251,8 @@ def save(data, samples, prior, results, arguments, name):
     draws = draws.reshape(-1, *draws.shape[2:])
     bands = {node: drawn(draws[:, i]) for i, node in enumerate(inner_nodes(data.tree))}
     means = {name: drawn(mean) for name, mean in data.means.items()}
-    nb.plot.tree(data.tree, shapes=means | {0: drawn(data.start)}, draws=bands, closed=not arguments.open)
+    size = np.clip(10 / len(means), 0.4, 1.0)  # inches
+    nb.plot.tree(data.tree, shapes=means | {0: drawn(data.start)}, draws=bands, closed=not arguments.open, size=size)
     plt.gca().set_xlabel("time since the root, in heights of the tree")
     times = f", deviations × {arguments.magnify:g}" if arguments.magnify != 1 else ""
     plt.gcf().suptitle(f"species, ancestors and draws of them{times}", fontsize="medium")
@@ -309,8 +310,8 @@ def read_shapes(arguments):
         raise ValueError(f"{file}: all shapes must have the same points; got {sorted(set(map(len, shapes)))}.")
     count = len(shapes[0])
     num_points = min(arguments.points, count)
-    chosen = np.round(np.arange(num_points) * count / num_points).astype(int)
-    return np.stack(shapes)[:, chosen], rows
+    chosen = np.linspace(0, count - 1 if arguments.open else count, num_points, endpoint=arguments.open)
+    return np.stack(shapes)[:, np.round(chosen).astype(int)], rows
 
 
 def column_of(rows, column, option):

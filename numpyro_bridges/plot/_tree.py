@@ -71,7 +71,7 @@ def tree(
         paper = {"colors": "white", "facecolors": "white" if closed else "none", "linewidths": 3.0, "zorder": 2}
         ax.add_collection(polygons(outline[None], closed, **paper, **place), autolim=False)
         if node in clouds:
-            opacity = float(np.clip(6.0 / len(clouds[node]), 0.1, 0.5))
+            opacity = float(np.clip(10.0 / len(clouds[node]), 0.15, 0.5))
             band = {"colors": ACCENT, "linewidths": 0.8, "alpha": opacity, "zorder": 3}
             ax.add_collection(polygons(clouds[node], closed, **band, **place), autolim=False)
         line = {"colors": START, "linewidths": 1.0, "zorder": 4}
