@@ -14,7 +14,7 @@ from phylogeny import analyse, options, prepare, settings
 
 import numpyro_bridges as nb
 
-arguments = settings(options("Wings of mosquitoes on the tree of their genera.", magnify=3.0).parse_known_args()[0])
+arguments = settings(options("Wings of mosquitoes on the tree of their genera.", magnify=4.0).parse_known_args()[0])
 
 # %% [markdown]
 # ## The data
