@@ -397,6 +397,7 @@ def table() -> dict[str, Row]:
             num_steps=("count", 1),
             t0=("number", 0.5),
             guide="guide?",
+            root_covariance=("array?", np.eye(len(X))),
             per_row="free",
             batch_shape="shape",
             batched="names?",

@@ -55,8 +55,11 @@ def shared_times(tree):
     return jnp.asarray(shared) @ lengths
 
 
-def joint(tree, x0, data, a, noise, rate=None, shift=0.0):
-    """Log density of all rows of data by one dense normal: dX = (shift − rate X) dt + √a dW, errors of each row."""
+def joint(tree, x0, data, a, noise, rate=None, shift=0.0, root=0.0):
+    """Log density of all rows of data by one dense normal: dX = (shift − rate X) dt + √a dW, errors of each row.
+
+    `root`: the covariance of the state at the root.
+    """
     shared = shared_times(tree)
     depth = jnp.diagonal(shared)
     if rate is None:
@@ -67,7 +70,8 @@ def joint(tree, x0, data, a, noise, rate=None, shift=0.0):
         drift = shift * -jnp.expm1(-rate * depth) / rate
     mean = decay[:, None, None] * x0 + drift[:, None, None]
     m, n = data.shape[:2]
-    covariance = jnp.kron(C, a) + jnp.diag(jnp.repeat(jnp.broadcast_to(noise, (m,)), n))
+    covariance = jnp.kron(C, a) + jnp.kron(jnp.outer(decay, decay), root * jnp.ones((n, n)))
+    covariance = covariance + jnp.diag(jnp.repeat(jnp.broadcast_to(noise, (m,)), n))
     r = (data - mean).reshape(m * n, -1)
     L = jnp.linalg.cholesky(covariance)
     y = jax.scipy.linalg.solve_triangular(L, r, lower=True)
@@ -301,6 +305,77 @@ def test_specimens_of_nonlinear_processes(key):
     np.testing.assert_allclose(law.given(z).path(data), one.given(z).path(means), atol=1e-10)
 
 
+# The root.
+
+ROOTED = nb.Tree(MANY.parents, MANY.lengths, MANY.names, [0, 0, *MANY.observed])  # seen twice itself
+ROOTED_ROWS = np.concatenate([ROWS, ROWS[:2] + 0.5])
+PRIOR = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 0.5]])
+OU = nb.LinearSDE(-0.7, np.linalg.cholesky(Q), 0.4)
+
+
+def test_a_root_with_a_prior_has_the_dense_normal():
+    """Value to 1e-8, gradients to 1e-6."""
+    p = {"x0": jnp.asarray(X0), "root": jnp.asarray(PRIOR), "noise": jnp.asarray(0.1)}
+
+    def ours(p):
+        match = nb.InexactMatch(p["noise"])
+        law = nb.DiffusionTree(OU, p["x0"], match, tree=ROOTED, root_covariance=p["root"])
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(ROOTED_ROWS)
+
+    def truth(p):
+        return joint(ROOTED, p["x0"], ROOTED_ROWS, Q, p["noise"], 0.7, 0.4, 0.5 * (p["root"] + p["root"].T))
+
+    found, slopes = jax.jit(jax.value_and_grad(ours))(p)
+    expected, true_slopes = jax.jit(jax.value_and_grad(truth))(p)
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    for key in p:
+        size = 1 + np.max(np.abs(true_slopes[key]))
+        np.testing.assert_allclose(slopes[key], true_slopes[key], rtol=1e-6, atol=1e-6 * size, err_msg=key)
+
+
+@pytest.mark.parametrize("prior", [0.8, np.array([2.0, 0.5, 0.1]), PRIOR], ids=["number", "diagonal", "matrix"])
+def test_the_posterior_of_the_root(prior, key):
+    """Every noise weighs the same; the root is drawn from its dense posterior, of which 0 is the mean."""
+    law = nb.DiffusionTree(
+        OU, X0, nb.InexactMatch(0.1), tree=ROOTED, num_steps=2, guide=nb.RecedingGuide(), root_covariance=prior
+    )
+    matrix = prior * np.eye(3) if np.ndim(prior) < 2 else prior
+    truth = joint(ROOTED, X0, ROOTED_ROWS, Q, 0.1, 0.7, 0.4, matrix)
+    laws = law.expand((8,))
+    z = jr.normal(key, laws.noise_prior().shape())
+    z = z.at[:7, 1:].set(0).at[:4, 0].set(0).at[1:4, 0, :, 0].set(np.eye(3))  # the mean, columns of a factor, any
+    data = np.broadcast_to(ROOTED_ROWS, (8, *ROOTED_ROWS.shape))
+    np.testing.assert_allclose(laws.given(z).log_prob(data), np.full(8, truth), rtol=1e-9)
+    roots = laws.given(z).nodes(data)[:, 0]
+
+    shared = np.asarray(shared_times(ROOTED))
+    depth = np.diag(shared)
+    C = np.exp(-0.7 * (depth[:, None] + depth)) * np.expm1(1.4 * shared) / 1.4
+    errors = np.kron(C, Q) + 0.1 * np.eye(3 * len(depth))
+    decay = np.kron(np.exp(-0.7 * depth)[:, None], np.eye(3))
+    residual = ROOTED_ROWS - (-np.expm1(-0.7 * depth) * 0.4 / 0.7)[:, None, None]
+    precision = decay.T @ np.linalg.solve(errors, decay) + np.linalg.inv(matrix)
+    pull = decay.T @ np.linalg.solve(errors, residual.reshape(-1, 2)) + np.linalg.solve(matrix, X0)
+    np.testing.assert_allclose(roots[0], np.linalg.solve(precision, pull), atol=1e-9)
+    factor = (roots[1:4, :, 0] - roots[0, :, 0]).T
+    np.testing.assert_allclose(factor @ factor.T, np.linalg.inv(precision), atol=1e-9)
+
+
+def test_samples_with_a_root_that_varies():
+    """Tips and root have the covariance of the tree and of the root."""
+    tree = nb.Tree(SMALL.parents, SMALL.lengths, SMALL.names, [0, *SMALL.observed])
+    law = nb.DiffusionTree(
+        nb.BrownianMotion(0.8), np.ones(2), nb.InexactMatch(0.05), tree=tree, root_covariance=np.array([0.5, 2.0])
+    )
+    draws = np.asarray(law.sample(jr.key(2), (8000,)))
+    for i, variance in enumerate((0.5, 2.0)):
+        values = draws[..., i] - 1
+        truth = variance + 0.8 * np.asarray(shared_times(tree)) + 0.05 * np.eye(4)
+        error = np.sqrt((np.outer(np.diag(truth), np.diag(truth)) + truth**2) / len(values))
+        assert np.all(np.abs(values.T @ values / len(values) - truth) < 4.5 * error)
+        assert np.all(error < 0.05 * np.diag(truth).max())
+
+
 # Nonlinear processes.
 
 
@@ -313,15 +388,29 @@ TEXT_LARGE = "(((a:.3,b:.4)x:.2,c:0):.3,(d:.2,(e:.1,f:.3):.2):.1);"
 LARGE = nb.Tree.from_newick(TEXT_LARGE)
 
 
-@pytest.mark.parametrize("num_steps", [4, 10])
-@pytest.mark.parametrize("tree", [SMALL, LARGE.observing(list("abcdef") + ["x"])], ids=["three tips", "six tips"])
-def test_evidence_by_brute_force(tree, num_steps):
+SEVEN = LARGE.observing(list("abcdef") + ["x"])
+SEEN_ROOT = nb.Tree(SMALL.parents, SMALL.lengths, SMALL.names, [0, *SMALL.observed])
+FORCED = {
+    "three tips, 4 steps": (SMALL, 4, None),
+    "three tips, 10 steps": (SMALL, 10, None),
+    "six tips, 4 steps": (SEVEN, 4, None),
+    "six tips, 10 steps": (SEVEN, 10, None),
+    "a root that varies": (SMALL, 4, 1.5),
+    "a root that varies and is seen": (SEEN_ROOT, 3, 1.5),
+}
+
+
+@pytest.mark.parametrize("name", FORCED)
+def test_evidence_by_brute_force(name):
     """The mean weight, against forward simulation in NumPy weighed by the density of the data."""
+    tree, num_steps, root = FORCED[name]
     rng = np.random.default_rng(num_steps)
     variance, x0, count = 0.3, 0.4, 400_000
     data = rng.normal(0.5, 0.4, (len(tree.observed), 1))
     depths, lengths = np.asarray(tree.depths), np.asarray(tree.lengths)
-    state, log_density = {0: np.full(count, x0)}, np.zeros(count)
+    state, log_density = {0: x0 + np.sqrt(root or 0.0) * rng.normal(size=count)}, np.zeros(count)
+    if 0 in tree.observed:
+        log_density += stats.norm(state[0], np.sqrt(variance)).logpdf(data[0, 0])
     for node in range(1, tree.num_nodes):
         x, t = state[tree.parents[node]], depths[tree.parents[node]]
         dt = lengths[node - 1] / num_steps
@@ -337,7 +426,9 @@ def test_evidence_by_brute_force(tree, num_steps):
     truth, error = weights.mean(), weights.std() / np.sqrt(count)
     assert error < 0.01 * truth
 
-    law = nb.DiffusionTree(sine(1.0), np.array([x0]), nb.InexactMatch(variance), tree=tree, num_steps=num_steps)
+    law = nb.DiffusionTree(
+        sine(1.0), np.array([x0]), nb.InexactMatch(variance), tree=tree, num_steps=num_steps, root_covariance=root
+    )
     z = jr.normal(jr.key(num_steps), (6000, *law.noise_prior().shape()))
     log_weights = jax.jit(jax.vmap(lambda z: law.given(z).log_prob(data)))(z)
     own = np.exp(log_weights)
@@ -354,14 +445,20 @@ KINDS = {
     "specimens": (nb.InexactMatch(0.1), MANY, None),
     "chain": (nb.InexactMatch(0.1), nb.Tree.chain([0.5, 0.7, 2.0]), None),
     "one branch": (nb.ExactMatch(), nb.Tree.star([1.2]), None),
+    "a root that varies": (nb.InexactMatch(0.1), ROOTED, None),
+    "fewer noises than states": (nb.InexactMatch(0.1), ROOTED, None),
 }
+OTHERS = {"a root that varies": {"root_covariance": 0.2 * PRIOR}}
+OTHERS["fewer noises than states"] = {"root_covariance": np.array([0.4, 0.2, 0.3])}
+NARROW = nb.SDE(lambda t, x, a: -x, lambda t, x, a: jnp.stack([jnp.cos(x[:, 0]), jnp.ones(3)], 1))
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_the_way_back_to_the_noise(name, key):
     """Simulated paths are those of their noise; paths meet at the nodes, and end in what is seen exactly."""
     match, tree, guide = KINDS[name]
-    law = nb.DiffusionTree(FLOW, X0, match, tree=tree, num_steps=3, guide=guide)
+    sde = NARROW if name.startswith("fewer") else FLOW
+    law = nb.DiffusionTree(sde, X0, match, tree=tree, num_steps=3, guide=guide, **OTHERS.get(name, {}))
 
     @jax.jit
     def there_and_back(key):
@@ -372,11 +469,12 @@ def test_the_way_back_to_the_noise(name, key):
 
     seen, paths, again, log_weight = there_and_back(key)
     np.testing.assert_allclose(again, paths, atol=1e-10)
+    assert (name in OTHERS) == (np.max(np.abs(paths[0, 0] - X0)) > 0)
     assert np.isfinite(log_weight)
     walk = schedule(tree.parents, tree.observed)
     for i, node in enumerate(walk.active):
         parent = tree.parents[node]
-        start = X0 if parent == 0 else paths[walk.active.index(parent), -1]
+        start = paths[0, 0] if parent == 0 else paths[walk.active.index(parent), -1]
         np.testing.assert_allclose(paths[i, 0], start, atol=1e-12)
     if isinstance(match, nb.ExactMatch):
         ends = [paths[walk.active.index(node), -1] for node in tree.observed]
@@ -517,6 +615,12 @@ WRONG = {
     "tree": (lambda: law(tree="(a:1);"), "`tree` must be a `Tree`"),
     "match": (lambda: law(match=nb.FrozenGuide()), "`match` must be a model of observation"),
     "root": (lambda: law(tree=nb.Tree([-1, 0], [1.0], None, [0, 1])), "`tree` must not have its root among"),
+    "root alone": (
+        lambda: law(tree=nb.Tree([-1, 0], [1.0], None, [0]), root_covariance=1.0),
+        "`tree` must have a seen node besides its root",
+    ),
+    "prior": (lambda: law(root_covariance=np.ones(2)), r"`root_covariance` must be a number, \(3,\) or \(3, 3\)"),
+    "no prior": (lambda: law(root_covariance=-1.0), "`root_covariance` must be positive definite"),
     "steps": (lambda: law(sde=sine(1.0)), "`num_steps` must be given"),
     "no steps": (lambda: law(num_steps=0), "`num_steps` must be a positive integer; got 0"),
     "inner exact": (lambda: law(match=nb.ExactMatch()), "1 of the seen nodes are no tips"),

@@ -293,7 +293,7 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
     "DiffusionTree, batch": (
         nb.DiffusionTree,
         {"sde": PLAIN, "x0": times(BATCH), "match": nb.InexactMatch(0.05), "tree": TREE, "num_steps": 1}
-        | {"batch_shape": (2,), "batched": ("x0",)},
+        | {"root_covariance": times([0.5, 0.2]), "batch_shape": (2,), "batched": ("x0", "root_covariance")},
         lambda law: observed(law, np.stack([SEVERAL, SEVERAL])),
     ),
 }  # fmt: skip

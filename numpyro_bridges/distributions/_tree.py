@@ -15,13 +15,14 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jaxtyping import ArrayLike
 
-from .._checks import as_float, positive_integer, require, require_finite, require_instance
+from .._checks import as_float, positive_integer, require, require_finite, require_instance, words
 from .._types import RealScalar, State
 from ..conditioning import AbstractMatch, fused
 from ..guiding import AbstractGuide
-from ..sdes import AbstractSDE
-from ..trees import Tree, TreeProblem, schedule
+from ..sdes import AbstractSDE, as_covariance
+from ..trees import Root, Tree, TreeProblem, schedule
 from ._batch import as_shape, find_batched, one_of
 from ._endpoint import check_law, close_parts, names_of, seen_shape
 from ._noise_driven import AbstractNoiseDriven
@@ -46,7 +47,9 @@ class DiffusionTree(AbstractNoiseDriven):
     **Arguments:**
 
     - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths.
-    - `x0`: the state at the root, `(n, dim)` or `(n,)`.
+    - `x0`: the state at the root, `(n, dim)` or `(n,)`; with a `root_covariance` the mean of its prior.
+    - `root_covariance`: C of the prior N(x0, C) of the state at the root, `()`, `(n,)` (a diagonal) or `(n, n)`, acting
+      on each coordinate column; left out, the root is at x0. It is marginalised, exactly where the SDE is linear.
     - `match`: how a node is seen, the same for all, or one for each row of data with `per_row=("match",)`: every array
       with an axis `(m,)` in front, as `jax.vmap` of a constructor returns it. So each row has an error of its own, or
       its own `mask` of an `InexactMatch`. Rows of one node are independent given its state: the variance of the match
@@ -60,12 +63,12 @@ class DiffusionTree(AbstractNoiseDriven):
 
     **Shapes:** `event_shape` is `(m, ...)`, one observation for each entry of `tree.observed`; data come in that order
     by `tree.rows`. The noise has shape `(branches * num_steps, k, dim)`, branches in preorder, those alone that lead to
-    something seen.
+    something seen. With a prior of the root ⌈n / k⌉ rows are in front.
 
     For a linear SDE with the default guide the density does not depend on the noise: it is the likelihood.
 
     **Errors:** `ValueError` as for `DiffusionEndpoint`, for `IntervalCensored`, for an exact match of an inner node
-    or of a node with several rows, and for a seen root.
+    or of a node with several rows, and for a seen root that has no prior.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class DiffusionTree(AbstractNoiseDriven):
         num_steps: int | None = None,
         t0: RealScalar = 0.0,
         guide: AbstractGuide | None = None,
+        root_covariance: ArrayLike | None = None,
         per_row: tuple[str, ...] = (),
         batch_shape: tuple[int, ...] = (),
         batched: tuple[str, ...] | None = None,
@@ -91,7 +95,13 @@ class DiffusionTree(AbstractNoiseDriven):
         require_instance(tree, Tree, "tree", "a `Tree`, such as `Tree.from_newick(text)`")
         if guide is not None:
             require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
-        require(0 not in tree.observed, "`tree` must not have its root among the seen nodes: `x0` is where it is.")
+        require(
+            root_covariance is not None or 0 not in tree.observed,
+            "`tree` must not have its root among the seen nodes: `x0` is where it is. Give it a prior by "
+            "`root_covariance`.",
+        )
+        require(any(tree.observed), "`tree` must have a seen node besides its root, which no branch leads to.")
+        prior = None if root_covariance is None else as_covariance(root_covariance, "root_covariance")
         own = names_of(per_row) or ()
         require(set(own) <= {"match"}, f"`per_row` may hold 'match'; got {per_row}.")
         require(
@@ -104,6 +114,7 @@ class DiffusionTree(AbstractNoiseDriven):
         start = as_float(t0, "t0")
         require(start.ndim == 0, f"`t0` must be one time; got shape {start.shape}.")
         parts = {"sde": sde, "x0": x0, "match": match, "guide": guide, "tree": tree, "t0": start, "settings": settings}
+        parts["root_covariance"] = prior
         names = find_batched(parts, batch_shape, declared, _check)
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
         datum = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(one))))
@@ -111,7 +122,8 @@ class DiffusionTree(AbstractNoiseDriven):
         close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1))
         branches = len(schedule(tree.parents, tree.observed).active)
         columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
-        noise_shape = (branches * settings.num_steps, one["sde"].noise_size(one["x0"]), columns)
+        k = one["sde"].noise_size(one["x0"])
+        noise_shape = (_root(one).num_rows(k) + branches * settings.num_steps, k, columns)
         super().__init__(
             parts, names, declared is not None, batch_shape, datum.shape, noise_shape, validate_args, ("t0",)
         )
@@ -182,6 +194,11 @@ def _check(parts):
                 f"shape {leaf.shape}. Build it by `jax.vmap`.",
             )
     check_law(_of_one_node(parts))
+    prior, n = parts["root_covariance"], parts["x0"].shape[0]
+    require(
+        prior is None or prior.ndim == 0 or prior.shape[0] == n,
+        f"`root_covariance` must be a number, ({n},) or ({n}, {n}), as the state has {n} rows; got {words(prior)}.",
+    )
 
 
 def _check_condition(parts, datum):
@@ -219,7 +236,11 @@ def _unled(parts, value) -> TreeProblem:
         conditions = fused(match, value, sizes, own, sde, x0)
     else:
         conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(match, value)
-    return TreeProblem.of(sde, parts["guide"], x0, tree, conditions, steps, parts["t0"])
+    return TreeProblem.of(sde, parts["guide"], _root(parts), tree, conditions, steps, parts["t0"])
+
+
+def _root(parts) -> Root:
+    return Root.of(parts["x0"], parts["root_covariance"])
 
 
 def _driving(parts, noise):
@@ -242,11 +263,10 @@ def _simulated(parts, key):
     tree, sde, match, own = parts["tree"], parts["sde"], parts["match"], parts["settings"].per_row
     blank = jnp.zeros((len(tree.observed), *seen_shape(_of_one_node(parts))), parts["x0"].dtype)
     problem = _unled(parts, blank)
-    x0, branches = problem.x0, problem.schedule.active
-    shape = (len(branches) * problem.num_steps, sde.noise_size(x0), *x0.shape[1:])
+    x0 = problem.x0
+    shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])
     paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))
-    row = {node: i for i, node in enumerate(branches)}
-    ends = paths[np.array([row[node] for node in tree.observed]), -1]
+    ends = problem.at_nodes(paths)[np.array(tree.observed)]
     keys = jr.split(key_seen, len(ends))
     draw = jax.vmap(lambda match, key, x: match.sample(key, sde, x), in_axes=(0 if "match" in own else None, 0, 0))
     return draw(match, keys, ends), paths

@@ -9,7 +9,7 @@ from ._base import (
 )
 from ._grid import TimeGrid as TimeGrid, time_grid as time_grid
 from ._kunita import KunitaFlow as KunitaFlow
-from ._linear import BrownianMotion as BrownianMotion, LinearSDE as LinearSDE
+from ._linear import BrownianMotion as BrownianMotion, LinearSDE as LinearSDE, as_covariance as as_covariance
 from ._noise import (
     AbstractNoise as AbstractNoise,
     GridNoise as GridNoise,

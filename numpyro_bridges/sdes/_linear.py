@@ -103,7 +103,7 @@ class BrownianMotion(AbstractSDE):
     has_exact_transition: ClassVar[bool] = True
 
     def __init__(self, covariance: ArrayLike, *, space: AbstractSpace | None = None):
-        self.covariance_operator = _covariance(covariance, "covariance")
+        self.covariance_operator = as_covariance(covariance, "covariance")
         require_space(space)
         self.space = space
 
@@ -266,7 +266,7 @@ class LinearSDE(AbstractSDE):
         return sigma.shape[1] if sigma.ndim == 2 and self.drift_operator.ndim == 0 else x.shape[0]
 
 
-def _covariance(value, name: str) -> Array:
+def as_covariance(value, name: str) -> Array:
     """A scalar, diagonal or matrix that is positive definite, where that can be known."""
     Q = as_float(value, name)
     require_finite(Q, name)

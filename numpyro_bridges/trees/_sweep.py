@@ -33,6 +33,7 @@ from .._types import State
 from ..conditioning import AbstractCondition, GaussianMessage, Observation
 from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, arrive, default_guide, follow, retrace, travel
 from ..sdes import AbstractSDE, BrownianMotion, Displaced
+from ._root import Root
 from ._schedule import Schedule, schedule
 from ._tree import Tree
 
@@ -103,7 +104,7 @@ class TreeProblem(eqx.Module):
 
     sde: AbstractSDE
     guide: AbstractGuide
-    x0: State
+    root: Root
     branches: Branch
     conditions: AbstractCondition
     """One for each seen node, along a leading axis."""
@@ -113,8 +114,9 @@ class TreeProblem(eqx.Module):
     schedule: Schedule = eqx.field(static=True)
 
     @classmethod
-    def of(cls, sde, guide, x0, tree: Tree, conditions: AbstractCondition, num_steps: int, t0) -> "TreeProblem":
+    def of(cls, sde, guide, root: Root, tree: Tree, conditions: AbstractCondition, num_steps: int, t0) -> "TreeProblem":
         """With every anchor at the root: for linear processes, for simulation, and before `anchored`."""
+        x0 = root.x0
         guide = default_guide(sde, x0) if guide is None else guide
         observed = tuple(dict.fromkeys(tree.observed))
         walk = schedule(tree.parents, observed)
@@ -125,7 +127,7 @@ class TreeProblem(eqx.Module):
 
         at_root = jnp.broadcast_to(x0, (tree.num_nodes - 1, *x0.shape))
         branches = Branch(tree.lengths, clock, at_root, at_root)
-        return cls(sde, guide, x0, branches, conditions, tree.parents, observed, num_steps, walk)
+        return cls(sde, guide, root, branches, conditions, tree.parents, observed, num_steps, walk)
 
     def anchored(self, t0) -> "TreeProblem":
         """With anchors where a Brownian motion would be, given the data; a linear process needs none."""
@@ -136,11 +138,28 @@ class TreeProblem(eqx.Module):
         walker = BrownianMotion(jnp.where(variance > 0, variance, 1.0), space=self.sde.space)
         rough = replace(self, sde=walker, guide=FrozenGuide(), num_steps=1)
         active = np.array(self.schedule.active)
-        still = jnp.zeros((len(active), *self.x0.shape), self.x0.dtype)
+        still = jnp.zeros((rough.num_noises, *self.x0.shape), self.x0.dtype)
         paths, _ = rough.down(rough.up(), still)
         anchors = jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape)).at[active].set(paths[:, -1])
+        anchors = anchors.at[0].set(paths[0, 0])
         above = np.array(self.parents[1:])
-        return replace(self, branches=self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above]))
+        branches = self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above])
+        return replace(self, root=replace(self.root, anchor=anchors[0]), branches=branches)
+
+    @property
+    def x0(self) -> State:
+        """The state at the root, or its prior mean."""
+        return self.root.x0
+
+    @property
+    def num_root_rows(self) -> int:
+        """Rows of noise in front of those of the branches."""
+        return self.root.num_rows(self.sde.noise_size(self.x0))
+
+    @property
+    def num_noises(self) -> int:
+        """Rows of noise."""
+        return self.num_root_rows + len(self.schedule.active) * self.num_steps
 
     @property
     def is_exact(self) -> bool:
@@ -181,6 +200,7 @@ class TreeProblem(eqx.Module):
             observed = apply(seen.operator, y[-1]) if seen.exact else observed
             return retrace(self._edge(branch), plan, seen, ts, y, observed, key)
 
+        key_root, key = jr.split(key)
         keys = jr.split(key, len(walk.active))
         at_inner, at_ends = ([place[node] for node in nodes] for nodes in (walk.inner, walk.ends))
         own, others = (_picked((paths, keys), rows) for rows in (at_inner, at_ends))
@@ -190,14 +210,16 @@ class TreeProblem(eqx.Module):
             branches = self._of(walk.inner)
             z = jax.vmap(inner)(branches, up.plans, up.observations, up.data, *own)
             noise = noise.at[np.array(at_inner)].set(z)
-        return noise.reshape(-1, *noise.shape[2:])
+        at_root = self.root.noise_of(up.at_root, paths[0, 0], noise.shape[2], key_root)
+        return jnp.concatenate([at_root, noise.reshape(-1, *noise.shape[2:])])
 
     @full_precision
     def simulate(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, "branches K+1 n *dim"]:
         """Unconditioned paths along every branch that has noise, in preorder."""
         walk = self.schedule
+        at_root, noise = noise[: self.num_root_rows], noise[self.num_root_rows :]
         noise = noise.reshape(len(walk.active), self.num_steps, *noise.shape[1:])
-        states = jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape))
+        states = jnp.broadcast_to(self.root.prior(at_root), (len(self.parents), *self.x0.shape))
 
         def step(states, inputs):
             node, parent, branch, is_end, z = inputs
@@ -232,6 +254,10 @@ class TreeProblem(eqx.Module):
     def _of(self, nodes: Sequence[int]) -> Branch:
         return _picked(self.branches, [node - 1 for node in nodes])
 
+    def _anchors(self, nodes: Sequence[int]) -> Float[Array, "nodes n *dim"]:
+        """Of some nodes, the root among them."""
+        return jnp.concatenate([self.root.anchor[None], self.branches.anchor])[np.array(nodes, int)]
+
     def _edge(self, branch: Branch) -> Displaced:
         return Displaced(self.sde, branch.anchor, branch.clock)
 
@@ -245,15 +271,15 @@ class TreeProblem(eqx.Module):
         message = GaussianMessage(message.operator, shift, message.factor, observed, message.log_scale)
         return _information(message, self.x0)
 
-    def _seen(self, condition: AbstractCondition, branch: Branch) -> tuple[Observation, State]:
-        """What is seen of the end of a branch, a displacement from its anchor."""
+    def _seen(self, condition: AbstractCondition, anchor: State) -> tuple[Observation, State]:
+        """What is seen of a node, a displacement from its anchor."""
         seen = condition.observation(self.sde, self.x0)
-        displaced = condition.displaced(apply(seen.operator, branch.anchor))
+        displaced = condition.displaced(apply(seen.operator, anchor))
         extra = jnp.zeros((0,), self.x0.dtype)
         return seen, displaced.target(self.x0, jnp.ones((), self.x0.dtype), extra).value
 
     def _led(self, condition, branch: Branch) -> Led:
-        seen, observed = self._seen(condition, branch)
+        seen, observed = self._seen(condition, branch.anchor)
         ts = self._grid(branch.length, condition.exact)
         plan = self.guide.plan(self._edge(branch), seen, jnp.zeros_like(self.x0), ts)
         return Led(plan, seen, observed, ts)
@@ -271,17 +297,17 @@ class TreeProblem(eqx.Module):
         blank = nothing(self.x0)
         totals = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), blank)
         totals = jax.tree.map(lambda a, b: a.at[above].add(b), totals, messages)
-        inside = [node for node in schedule.inner if node in self.observed]
+        inside = [node for node in (0, *schedule.inner) if node in self.observed]
         if inside:
 
-            def one(condition, branch):
-                seen, observed = self._seen(condition, branch)
+            def one(condition, anchor):
+                seen, observed = self._seen(condition, anchor)
                 shift = jnp.zeros_like(observed)
                 factor = seen.factor if seen.factor is not None else jnp.zeros((), self.x0.dtype)
                 message = GaussianMessage(seen.operator, shift, factor, observed, seen.log_scale)
                 return _information(message, self.x0)
 
-            own = jax.vmap(one)(self._rows(inside), self._of(inside))
+            own = jax.vmap(one)(self._rows(inside), self._anchors(inside))
             totals = jax.tree.map(lambda a, b: a.at[np.array(inside)].add(b), totals, own)
         return totals
 
@@ -322,19 +348,21 @@ class TreeProblem(eqx.Module):
         return UpwardPass(plans, observations, data, ends, at_root)
 
     def log_evidence(self, up: UpwardPass) -> Float[Array, ""]:
-        """The message at the root: the log likelihood itself where the process is linear."""
-        return up.at_root.c  # the root's anchor is x0
+        """The message at the root under its prior: the log likelihood itself where the process is linear."""
+        return self.root.log_evidence(up.at_root)
 
     def down(self, up: UpwardPass, noise: Float[Array, "steps k *dim"]):
         """States of every active node's branch `(active, K + 1, n, dim)`, and Ψ."""
         schedule, K = self.schedule, self.num_steps
         place = {node: i for i, node in enumerate(schedule.active)}
+        at_root, noise = noise[: self.num_root_rows], noise[self.num_root_rows :]
+        root, root_weight = self.root.posterior(up.at_root, at_root)
         noise = noise.reshape(len(schedule.active), K, *noise.shape[1:])
         inner, ends = schedule.inner, schedule.ends
         at_inner = np.array([place[node] for node in inner], int)
         at_ends = np.array([place[node] for node in ends], int)
         states = jnp.zeros((schedule.num_slots + 1, *self.x0.shape), self.x0.dtype)
-        states = varying_like(states.at[0].set(self.x0), self.sde, self.branches, up, noise)
+        states = varying_like(states.at[0].set(root), self.sde, self.branches, up, noise)
 
         def step(states, inputs):
             branch, plan, seen, w, z, slot, parent_slot = inputs
@@ -349,7 +377,7 @@ class TreeProblem(eqx.Module):
             np.array(schedule.slot, int), np.array(schedule.parent_slot, int),
         )  # fmt: skip
         _, (inner_paths, inner_weights) = jax.lax.scan(step, states, inputs)
-        known = jnp.concatenate([self.x0[None], inner_paths[:, -1]])
+        known = jnp.concatenate([root[None], inner_paths[:, -1]])
         number = {0: 0} | {node: i + 1 for i, node in enumerate(inner)}
         starts = known[np.array([number[self.parents[node]] for node in ends])]
 
@@ -364,12 +392,12 @@ class TreeProblem(eqx.Module):
         end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
         paths = jnp.zeros((len(schedule.active), K + 1, *self.x0.shape), self.x0.dtype)
         paths = paths.at[at_ends].set(end_paths).at[at_inner].set(inner_paths)
-        log_weight = jnp.sum(inner_weights) + jnp.sum(end_weights)
-        return paths, log_weight + self._log_density_inside(inner_paths[:, -1])
+        log_weight = root_weight + jnp.sum(inner_weights) + jnp.sum(end_weights)
+        return paths, log_weight + self._log_density_inside(known)
 
     def _log_density_inside(self, states):
-        """Log density of what is seen at inner nodes, given their states."""
-        inner = self.schedule.inner
+        """Log density of what is seen at the root and at inner nodes, given their states."""
+        inner = (0, *self.schedule.inner)
         chosen = [i for i, node in enumerate(inner) if node in self.observed]
         if not chosen:
             return jnp.zeros((), self.x0.dtype)
