@@ -52,6 +52,7 @@ def options(description, **defaults):
     parser.add_argument("--steps", type=int, default=6, help="on each branch")
     parser.add_argument("--warmup", type=int, default=200)
     parser.add_argument("--samples", type=int, default=400)
+    parser.add_argument("--fixed-root", action="store_true", help="the root is the mean, for certain")
     parser.add_argument("--run", type=Path, help="a directory to save the run in as it goes, and to go on from")
     parser.add_argument("--magnify", type=float, default=1.0, help="deviations from the start in the drawing")
     parser.add_argument("--open", action="store_true", help="curves whose ends do not meet")
@@ -77,8 +78,8 @@ def settings(arguments):
 # %% [markdown]
 # ## The data
 # The tree is made one unit high: amplitudes say what happens between its root and the present. It sees a row for each
-# specimen of a species. The flow starts at its first split, at the mean that Brownian motion would have there given the
-# means of the species, by generalised least squares.
+# specimen of a species. The flow starts at its first split, around the mean that Brownian motion would have there given
+# the means of the species, by generalised least squares.
 
 
 # %%
@@ -140,7 +141,8 @@ def mean_at_root(tree, rows):
 
 # %% [markdown]
 # ## The model
-# Where no species has two specimens nothing is known of the variation within, and its SD is given by `--sd`.
+# The root is as far from that mean as the flow would come in the time of another tree, a priori; with `--fixed-root` it
+# is there. Where no species has two specimens nothing is known of the variation within, and its SD is given by `--sd`.
 
 
 # %%
@@ -151,7 +153,7 @@ def parameters(several, sd):
     return amplitude, length_scale, within
 
 
-def law_of(data, num_steps, amplitude, length_scale, within):
+def law_of(data, arguments, amplitude, length_scale, within):
     space, seen = nb.Landmarks(*data.start.shape), np.isfinite(data.rows).all(axis=-1)
     flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale))
     if seen.all():
@@ -159,12 +161,13 @@ def law_of(data, num_steps, amplitude, length_scale, within):
     else:
         match = jax.vmap(lambda points: nb.InexactMatch.from_point_sd(within, space, mask=points))(seen)
         own = ("match",)
-    return nb.DiffusionTree(flow, data.start, match, tree=data.tree, num_steps=num_steps, per_row=own)
+    prior = {} if arguments.fixed_root else {"root_covariance": flow.covariance(0.0, data.start)}
+    return nb.DiffusionTree(flow, data.start, match, tree=data.tree, num_steps=arguments.steps, per_row=own, **prior)
 
 
-def model_of(data, num_steps, sd):
+def model_of(data, arguments, sd):
     def model(rows=None):
-        nb.sample("specimens", law_of(data, num_steps, *parameters(data.several, sd)), obs=rows)
+        nb.sample("specimens", law_of(data, arguments, *parameters(data.several, sd)), obs=rows)
 
     return model
 
@@ -176,7 +179,7 @@ def model_of(data, num_steps, sd):
 # %%
 def infer(data, arguments, sd):
     """Posterior draws by chain, and results for ArviZ with the ancestors among the posterior."""
-    kernel = nb.infer.FunctionSpaceHMC(model_of(data, arguments.steps, sd))
+    kernel = nb.infer.FunctionSpaceHMC(model_of(data, arguments, sd))
     run = {"num_warmup": arguments.warmup, "num_samples": arguments.samples, "num_chains": 2 if arguments.quick else 4}
     mcmc = MCMC(kernel, chain_method="vectorized", **run)
     start, key = time.perf_counter(), jr.key(arguments.seed)
@@ -190,16 +193,16 @@ def infer(data, arguments, sd):
     print(f"{arguments.samples} draws; divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
     prior = Predictive(parameters, num_samples=2000)(jr.key(1), data.several, sd)
     results = nb.to_arviz(mcmc, prior=prior)
-    results["posterior"]["ancestor"] = ancestors(data, arguments.steps, sd, samples)
+    results["posterior"]["ancestor"] = ancestors(data, arguments, sd, samples)
     return {name: samples[name] for name in prior}, prior, results
 
 
-def ancestors(data, num_steps, sd, samples):
-    """The inner nodes but the root: a draw of the parameters and the noise is a draw of the paths, not to be redone."""
-    rows, inner = np.nan_to_num(data.rows), inner_nodes(data.tree)
+def ancestors(data, arguments, sd, samples):
+    """The inner nodes: a draw of the parameters and the noise is a draw of the paths, nothing is to be simulated."""
+    rows, inner = np.nan_to_num(data.rows), inner_nodes(data.tree, arguments)
 
     def states(draw):
-        law = law_of(data, num_steps, draw["amplitude"], draw["length_scale"], draw.get("within", sd))
+        law = law_of(data, arguments, draw["amplitude"], draw["length_scale"], draw.get("within", sd))
         return law.given(draw["specimens_noise"]).nodes(rows)[np.array(inner)]
 
     shape = samples["specimens_noise"].shape[:2]
@@ -210,8 +213,9 @@ def ancestors(data, num_steps, sd, samples):
     return xr.DataArray(np.reshape(found, (*shape, *found.shape[1:])), dims=dims, coords=coords)
 
 
-def inner_nodes(tree):
-    return [node for node in range(1, tree.num_nodes) if node not in tree.tips]
+def inner_nodes(tree, arguments):
+    """Numbers of the ancestors that are not known."""
+    return [node for node in range(int(arguments.fixed_root), tree.num_nodes) if node not in tree.tips]
 
 
 def name_of(tree, node):
@@ -234,7 +238,7 @@ def report(results, samples, prior):
 # %% [markdown]
 # ## What is left behind: a NetCDF file and two figures
 # Outlines of posterior draws lie around the mean of each ancestor. They hold the uncertainty in parameters and paths,
-# not that in the tree. The root is where the flow starts, and fixed.
+# not that in the tree.
 
 
 # %%
@@ -249,10 +253,11 @@ def save(data, samples, prior, results, arguments, name):
 
     draws = np.asarray(results["posterior"]["ancestor"])
     draws = draws.reshape(-1, *draws.shape[2:])
-    bands = {node: drawn(draws[:, i]) for i, node in enumerate(inner_nodes(data.tree))}
+    bands = {node: drawn(draws[:, i]) for i, node in enumerate(inner_nodes(data.tree, arguments))}
     means = {name: drawn(mean) for name, mean in data.means.items()}
     size = np.clip(10 / len(means), 0.4, 1.0)  # inches
-    nb.plot.tree(data.tree, shapes=means | {0: drawn(data.start)}, draws=bands, closed=not arguments.open, size=size)
+    fixed = {0: drawn(data.start)} if arguments.fixed_root else {}
+    nb.plot.tree(data.tree, shapes=means | fixed, draws=bands, closed=not arguments.open, size=size)
     plt.gca().set_xlabel("time since the root, in heights of the tree")
     times = f", deviations × {arguments.magnify:g}" if arguments.magnify != 1 else ""
     plt.gcf().suptitle(f"species, ancestors and draws of them{times}", fontsize="medium")

@@ -69,7 +69,7 @@ def test_phylogeny_reads_files(tmp_path):
     chosen = "--shapes shapes.tps --table table.csv --names tip --tree tree.nwk --quick --output output".split()
     out = run(str(ROOT / "examples/phylogeny.py"), *chosen, cwd=tmp_path)
     assert "tips without shapes, left out: d" in out and "5 specimens of 3 species, 10 points" in out
-    assert "r_hat" in out and "divergences: 0" in out and "ancestors: 20 coordinates" in out
+    assert "r_hat" in out and "divergences: 0" in out and "ancestors: 40 coordinates" in out
     for name in ("phylogeny.nc", "phylogeny_ladder.png", "phylogeny_posterior.png"):
         assert (tmp_path / "output" / name).stat().st_size > 5000
 
@@ -120,7 +120,7 @@ def test_mosquito_tree(tmp_path):
     pytest.importorskip("ktch")
     pytest.importorskip("matplotlib")
     out = run(str(ROOT / "examples/mosquito_tree.py"), "--quick", "--output", "output", cwd=tmp_path)
-    assert "126 specimens of 11 species, 16 points" in out and "r_hat" in out and "ancestors: 288 coordinates" in out
+    assert "126 specimens of 11 species, 16 points" in out and "r_hat" in out and "ancestors: 320 coordinates" in out
     for name in ("mosquito_tree.nc", "mosquito_tree_ladder.png", "mosquito_tree_posterior.png"):
         assert (tmp_path / "output" / name).stat().st_size > 5000
 
