@@ -125,6 +125,7 @@ def test_mosquito_tree(tmp_path):
         assert (tmp_path / "output" / name).stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_growth(tmp_path):
     pytest.importorskip("matplotlib")
     out = run(str(ROOT / "examples/growth.py"), "--quick", "--output", "output", cwd=tmp_path)
