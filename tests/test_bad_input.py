@@ -615,6 +615,7 @@ def table() -> dict[str, Row]:
         "datasets.mosquito_wings": row(
             nb.datasets.mosquito_wings, True, num_points=("count from 3", 4), genus=("name?", "UR")
         ),
+        "datasets.mosquito_tree": row(nb.datasets.mosquito_tree),
         "datasets.ellipses": row(
             nb.datasets.ellipses,
             num_points=("count from 3", 4),
@@ -744,6 +745,18 @@ def table() -> dict[str, Row]:
             file=("file", FILE),
             scale=("setting?", 0.1),
             closed=("flag", True),
+        ),
+        "plot.tree": row(
+            plot.tree,
+            False,
+            drawn,
+            tree=("tree", TREE),
+            ax="axes?",
+            shapes=("array? with gaps", np.stack([SQUARE] * 5)),
+            draws=("array? with gaps", np.stack([SQUARE] * 5)[None]),
+            closed=("flag", True),
+            size=("setting", 0.5),
+            max_outlines=("count", 2),
         ),
         "plot.posterior": row(
             plot.posterior,

@@ -77,6 +77,34 @@ def test_without_ktch(monkeypatch):
         datasets.mosquito_wings()
 
 
+def test_mosquito_tree():
+    """Clades as published, and Grafen's heights: the number of tips below a node, less one, in units of the root's."""
+    tree = datasets.mosquito_tree()
+    assert set(tree.observed_names) == set("AE AN CA CX DE MA OR PS TO UR WY".split())
+    below = {node: [tip for tip in tree.tips if node in lineage(tree, tip)] for node in range(tree.num_nodes)}
+    clades = {"".join(sorted(tree.names[tip] for tip in tips)) for tips in below.values() if 1 < len(tips) < 11}
+    deeper = {"AECACXDEMAORPSTOURWY", "AECACXDEMAORPSTOWY", "CACXDEMAORTOWY", "CAMAORTOWY"}
+    assert clades == deeper | {"CAMAOR", "CAOR", "TOWY", "CXDE", "AEPS"}
+    ages = [(len(below[node]) - 1) / 10 for node in range(tree.num_nodes)]
+    np.testing.assert_allclose(tree.ages, ages, atol=1e-6)
+    names = {name: node for node, name in enumerate(tree.names) if name}
+    assert {tree.names[tip] for tip in below[names["Culicini"]]} == {"CX", "DE"}
+    assert {tree.names[tip] for tip in below[names["Aedini"]]} == {"AE", "PS"}
+    assert len(below[names["Culicinae"]]) == 10
+
+
+def lineage(tree, node):
+    nodes = [node]
+    while nodes[-1] > 0:
+        nodes.append(tree.parents[nodes[-1]])
+    return nodes
+
+
+@needs_ktch
+def test_tips_of_the_tree_are_the_genera_of_the_wings():
+    assert set(datasets.mosquito_wings(num_points=3).labels) == set(datasets.mosquito_tree().observed_names)
+
+
 def test_ellipses():
     shapes = datasets.ellipses(num_points=16, aspects=(1.0, 2.0))
     check_in_register(shapes, 2, 16)

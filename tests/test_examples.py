@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import numpyro_bridges as nb
@@ -52,6 +53,84 @@ def test_mosquito_wings(tmp_path):
     out = run(str(ROOT / "examples/mosquito_wings.py"), "--quick", "--output", "output", cwd=tmp_path)
     assert "r_hat" in out and "divergences: 0" in out
     for name in ("wings.nc", "bridges.png", "posterior.png", "score.png"):
+        assert (tmp_path / "output" / name).stat().st_size > 5000
+
+
+def test_phylogeny_reads_files(tmp_path):
+    """Three species, one of a single specimen, a point that is missing, and a tip without a shape."""
+    pytest.importorskip("matplotlib")
+    rng = np.random.default_rng(0)
+    ellipses = dict(zip("abc", nb.datasets.ellipses(num_points=10, aspects=(1.0, 1.2, 1.5)).points, strict=True))
+    shapes = [ellipses[name] + 0.02 * rng.normal(size=(10, 2)) for name in "aabbc"]
+    shapes[3][7] = np.nan
+    nb.io.write_tps(tmp_path / "shapes.tps", [nb.io.Specimen(shape, id=str(i)) for i, shape in enumerate(shapes)])
+    (tmp_path / "table.csv").write_text("tip\n" + "\n".join("aabbc"))
+    (tmp_path / "tree.nwk").write_text("(((a:1,b:1)ab:1,c:2):0.5,d:2.5);")
+    chosen = "--shapes shapes.tps --table table.csv --names tip --tree tree.nwk --quick --output output".split()
+    out = run(str(ROOT / "examples/phylogeny.py"), *chosen, cwd=tmp_path)
+    assert "tips without shapes, left out: d" in out and "5 specimens of 3 species, 10 points" in out
+    assert "r_hat" in out and "divergences: 0" in out and "ancestors: 40 coordinates" in out
+    for name in ("phylogeny.nc", "phylogeny_ladder.png", "phylogeny_posterior.png"):
+        assert (tmp_path / "output" / name).stat().st_size > 5000
+
+
+PREPARED = """
+import sys
+sys.path.insert(0, sys.argv.pop())
+import numpy as np
+import numpyro_bridges as nb
+import phylogeny
+
+# Generalised least squares on ((a:1,b:1):1,c:2): C⁻¹1 = (1/3, 1/3, 1/2).
+tree = nb.Tree.from_newick("((a:2,b:2):2,c:4):3;")
+shapes = np.random.default_rng(0).normal(size=(4, 3, 2))
+data = phylogeny.prepare(shapes, ["b", "c", "a", "b"], tree)
+np.testing.assert_allclose(data.tree.depths, [0, 0.5, 1, 1, 1])
+a, b, c = shapes[2], shapes[[0, 3]].mean(axis=0), shapes[1]
+np.testing.assert_allclose(data.start, (2 * a + 2 * b + 3 * c) / 7, atol=1e-5)
+np.testing.assert_allclose(data.rows, shapes[[2, 0, 3, 1]])
+assert phylogeny.name_of(data.tree, 1) == "a–b"
+np.savetxt("shapes.csv", np.c_[shapes.reshape(4, 6)], delimiter=",", header="x1,y1,x2,y2,x3,y3", comments="")
+open("named.csv", "w").write("id,x1,y1,x2,y2,x3,y3\\nAlpha,0,0,1,0,0,1\\nbeta,0,0,1,0,0,2\\n")
+open("tree.nwk", "w").write("(alpha:1,beta:1);")
+for names in ("shapes.csv tree.nwk", "named.csv tree.nwk", "no.csv tree.nwk", "named.csv no.nwk"):
+    shapes, tree = names.split()
+    sys.argv[1:] = ["--shapes", shapes, "--tree", tree]
+    try:
+        phylogeny.main()
+    except SystemExit as end:
+        print(end.code, file=sys.stderr)
+"""
+
+
+def test_phylogeny_prepares_data_and_says_what_is_wrong(tmp_path):
+    pytest.importorskip("matplotlib")
+    command = [sys.executable, "-c", PREPARED, str(ROOT / "examples")]
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    said = [line for line in done.stderr.splitlines() if "error:" in line]
+    assert len(said) == 4 and done.stderr.split().count("2") == 4
+    assert "--names must be a column that every specimen has filled, one of []; got 'id'" in said[0]
+    assert "'Alpha'" in said[1] and "alpha" in said[1]
+    assert "no.csv" in said[2] and "no.nwk" in said[3]
+
+
+@pytest.mark.slow
+def test_mosquito_tree(tmp_path):
+    pytest.importorskip("ktch")
+    pytest.importorskip("matplotlib")
+    out = run(str(ROOT / "examples/mosquito_tree.py"), "--quick", "--output", "output", cwd=tmp_path)
+    assert "126 specimens of 11 species, 16 points" in out and "r_hat" in out and "ancestors: 320 coordinates" in out
+    for name in ("mosquito_tree.nc", "mosquito_tree_ladder.png", "mosquito_tree_posterior.png"):
+        assert (tmp_path / "output" / name).stat().st_size > 5000
+
+
+@pytest.mark.slow
+def test_growth(tmp_path):
+    pytest.importorskip("matplotlib")
+    out = run(str(ROOT / "examples/growth.py"), "--quick", "--output", "output", cwd=tmp_path)
+    assert "12 animals, 6 ages" in out and "r_hat" in out and "the truth: rate 3" in out
+    for name in ("growth.nc", "growth_series.png", "growth_posterior.png"):
         assert (tmp_path / "output" / name).stat().st_size > 5000
 
 

@@ -181,6 +181,93 @@ def test_score_frames_errors(flows):
         plot.score_frames(line, np.zeros((3, 2)), 0.0, "never.png")
 
 
+LADDER = nb.Tree.from_newick("((a:1,b:2)ab:1,c:4):1;")  # root, ab with its parent at 1, three tips
+
+
+def drawn_on(ax, layer):
+    """Vertices of the shapes of one layer, in inches from the lower left corner of the figure, by their order."""
+    ax.figure.canvas.draw()
+    lines = [line for line in ax.collections if line.get_zorder() == layer]
+    points = [line.get_transform().transform([path.vertices for path in line.get_paths()][0]) for line in lines]
+    return [inches / ax.figure.dpi for inches in points]
+
+
+def test_tree():
+    branches = plot.tree(LADDER)
+    ax = branches.axes
+    # Tips lie at 0, −1 and −2 from top to bottom, an inner node in the middle of its children.
+    depths, rows = [0, 1, 2, 3, 4, 5], [-1.25, -1.25, -0.5, 0, -1, -2]
+    drawn = np.stack([path.vertices for path in branches.get_paths()])
+    above = [0, 1, 2, 2, 1]
+    corners = [[[depths[up], rows[up]], [depths[up], rows[i]], [depths[i], rows[i]]] for i, up in enumerate(above, 1)]
+    np.testing.assert_allclose(drawn, corners)
+    assert [text.get_text() for text in ax.texts] == ["a", "b", "c"]
+    assert [tuple(text.xy) for text in ax.texts] == [(3, 0), (4, -1), (5, -2)]
+    assert ax.get_xlabel() == "time since the root" and ax.get_xlim() == (0, 5)
+    with pytest.raises(ValueError, match="`tree` must be a `Tree`"):
+        plot.tree("(a:1,b:1);")
+
+
+def test_tree_with_shapes(shapes):
+    """One scale for all shapes, tips beside their ends, inner nodes on them, with outlines of draws around."""
+    rng = np.random.default_rng(0)
+    cloud = shapes.points[1] + 0.1 * rng.normal(size=(60, 12, 2))
+    given = {"a": shapes.points[0], 5: shapes.points[3], "ab": shapes.points[1]}
+    branches = plot.tree(LADDER, shapes=given, draws={2: cloud, 0: cloud}, size=0.8, max_outlines=10)
+    ax = branches.axes
+    outlines = dict(zip([2, 0, 3, 5], drawn_on(ax, 4), strict=True))
+    at = {node: ax.transData.transform(xy) / ax.figure.dpi for node, xy in nodes_of(branches).items()}
+    chosen = cloud[np.linspace(0, 59, 10).round().astype(int)]
+    expected = {0: chosen.mean(axis=0), 2: given["ab"], 3: given["a"], 5: given[5]}
+    extents = [np.ptp(points, axis=0) for points in (chosen.reshape(-1, 2), *expected.values())]
+    scale = 0.8 / np.max(extents)
+    for node, outline in expected.items():
+        middle = (outline.min(0) + outline.max(0)) / 2
+        on_paper = outlines[node][:-1] - at[node]
+        shift = on_paper[0] - scale * (outline - middle)[0]
+        np.testing.assert_allclose(on_paper - shift, scale * (outline - middle), atol=1e-9)
+        beside = shift[0] - scale * np.max(extents, axis=0)[0] / 2
+        assert np.allclose(shift, 0, atol=1e-9) if node in (0, 2) else beside > 0 and abs(shift[1]) < 1e-9
+    bands = [line for line in ax.collections if line.get_zorder() == 3]
+    drawn = np.stack([path.vertices[:-1] for path in bands[0].get_paths()])
+    middle = (given["ab"].min(0) + given["ab"].max(0)) / 2
+    np.testing.assert_allclose(drawn, chosen - middle)
+    assert len(bands) == 2 and bands[0].get_alpha() < 1
+
+
+def nodes_of(branches):
+    """Where the nodes lie on the axes, from the ends of the branches."""
+    ends = [path.vertices for path in branches.get_paths()]
+    return {0: ends[0][0]} | {node: end[-1] for node, end in enumerate(ends, 1)}
+
+
+def test_tree_of_arrays_on_given_axes(shapes):
+    """An array for all nodes is the same as shapes by number; a node without shape is NaN; a chain names its nodes."""
+    figure, axes = plt.subplots(2)
+    chain = nb.Tree.chain([1.0, 3.0], names=["young", "old"])
+    several = np.stack([np.full((12, 2), np.nan), shapes.points[0], shapes.points[1]])
+    first = plot.tree(chain, axes[0], shapes=several, draws=np.stack([several, several]), closed=False)
+    plot.tree(chain, axes[1], shapes={"young": several[1], 2: several[2]}, closed=False)
+    assert first.axes is axes[0] and len(plt.get_fignums()) == 1
+    whole, by_name = drawn_on(axes[0], 4), drawn_on(axes[1], 4)
+    assert [len(outline) for outline in whole] == [12, 12]
+    for one, other in zip(whole, by_name, strict=True):
+        np.testing.assert_allclose(one - one[0], other - other[0], atol=1e-9)
+    assert sorted(text.get_text() for text in axes[0].texts) == ["old", "young"]
+
+
+def test_tree_errors(shapes):
+    point = shapes.points[0]
+    with pytest.raises(ValueError, match=r"`shapes` must be given by names of nodes, .* from 0 to 5; got 'd'"):
+        plot.tree(LADDER, shapes={"d": point})
+    with pytest.raises(ValueError, match=r"`draws\['a'\]` must have the shape \(S, n, 2\), got \(12, 2\)"):
+        plot.tree(LADDER, draws={"a": point})
+    with pytest.raises(ValueError, match=r"`shapes` must have the shape \(num_nodes, n, 2\) with 6 nodes, got \(4"):
+        plot.tree(LADDER, shapes=shapes.points)
+    with pytest.raises(ValueError, match="`size` must be a positive number of inches; got 0"):
+        plot.tree(LADDER, size=0)
+
+
 def test_posterior():
     rng = np.random.default_rng(0)
     samples = {
@@ -243,6 +330,10 @@ def test_without_matplotlib(monkeypatch, shapes):
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    for draw in (lambda: plot.outlines(shapes.points), lambda: plot.posterior({"a": np.arange(3.0)})):
+    for draw in (
+        lambda: plot.outlines(shapes.points),
+        lambda: plot.posterior({"a": np.arange(3.0)}),
+        lambda: plot.tree(LADDER),
+    ):
         with pytest.raises(ImportError, match=r"pip install 'numpyro_bridges\[examples\]'"):
             draw()

@@ -18,16 +18,20 @@ def pyplot() -> Any:
     return plt
 
 
+def check_axes(ax: Any) -> None:
+    require(
+        ax is None or hasattr(ax, "add_collection"),
+        f"`ax` must be axes of matplotlib, such as `plt.subplots()[1]`; got {words(ax)}.",
+    )
+
+
 def shape_axes(ax: Any, points: NDArray, size: float = 5.0) -> Any:
     """The given axes, or new ones without frame in the proportions of (..., 2) points, `size` inches long.
 
     One unit is as long in x as in y.
     """
     plt = pyplot()
-    require(
-        ax is None or hasattr(ax, "add_collection"),
-        f"`ax` must be axes of matplotlib, such as `plt.subplots()[1]`; got {words(ax)}.",
-    )
+    check_axes(ax)
     if ax is None:
         extent = np.ptp(seen(points), axis=0)
         longest = extent.max()
@@ -39,14 +43,19 @@ def shape_axes(ax: Any, points: NDArray, size: float = 5.0) -> Any:
     return ax
 
 
-def draw(ax: Any, shapes: NDArray, closed: bool, **kwargs: Any) -> Any:
+def polygons(shapes: NDArray, closed: bool, **kwargs: Any) -> Any:
     """Polygons (N, n, 2) as one `LineCollection`; a missing (NaN) point leaves a gap."""
     from matplotlib.collections import LineCollection
 
     if closed:
         shapes = np.concatenate([shapes, shapes[:, :1]], axis=1)
     style: dict[str, Any] = {"capstyle": "round", "joinstyle": "round"}
-    lines = LineCollection(list(shapes), **style | kwargs)
+    return LineCollection(list(shapes), **style | kwargs)
+
+
+def draw(ax: Any, shapes: NDArray, closed: bool, **kwargs: Any) -> Any:
+    """Polygons on axes, which grow to hold them."""
+    lines = polygons(shapes, closed, **kwargs)
     ax.add_collection(lines, autolim=False)
     ax.update_datalim(seen(shapes))
     ax.autoscale_view()

@@ -1,0 +1,348 @@
+# %% [markdown]
+# # How fast did shape evolve along a phylogeny, on what length scale, and what did the ancestors look like?
+#
+# A Kunita flow runs along the branches of a tree, from the root to the species: points close together move together,
+# over a length scale ℓ, by amounts set by an amplitude α. Specimens differ from the shape of their species by
+# independent normal errors at every point, of an SD that is a parameter too. MCMC draws from the posterior of these
+# three and of the paths along the branches, whose ends are the ancestors.
+#
+#     python examples/phylogeny.py --shapes wings.tps --tree tree.nwk                      # ID= is the species
+#     python examples/phylogeny.py --shapes wings.csv --names species --tree tree.nex
+#     python examples/phylogeny.py --shapes wings.tps --table specimens.csv --names tip --tree tree.nwk
+#     python examples/phylogeny.py ... --quick       # under a minute, to see that all runs
+#     python examples/phylogeny.py ... --run saved   # saved as it goes; after a kill the same line goes on from there
+#
+# Shapes come in a tps or CSV file, row i being the same place on each; names are those of the tree, in Newick or NEXUS.
+# A species without a shape is left out of the tree, a shape without its tip is an error; points may be missing.
+
+# %%
+import argparse
+import csv
+import gzip
+import os
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads of its own slow small matrices down, many times over
+
+import arviz as az
+import jax
+import jax.random as jr
+import matplotlib
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import xarray as xr
+from numpyro.infer import MCMC, Predictive
+
+import numpyro_bridges as nb
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+numpyro.set_host_device_count(2)
+
+
+def options(description, **defaults):
+    """A parser with what any run may choose."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--quick", action="store_true", help="16 points, few steps and draws, 2 chains")
+    parser.add_argument("--points", type=int, default=32, help="landmarks, at equal steps of their number")
+    parser.add_argument("--steps", type=int, default=6, help="on each branch")
+    parser.add_argument("--warmup", type=int, default=200)
+    parser.add_argument("--samples", type=int, default=400)
+    parser.add_argument("--fixed-root", action="store_true", help="the root is the mean, for certain")
+    parser.add_argument("--run", type=Path, help="a directory to save the run in as it goes, and to go on from")
+    parser.add_argument("--magnify", type=float, default=1.0, help="deviations from the start in the drawing")
+    parser.add_argument("--open", action="store_true", help="curves whose ends do not meet")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=Path("output"))
+    parser.set_defaults(**defaults)
+    return parser
+
+
+def files(parser, required):
+    parser.add_argument("--shapes", type=Path, required=required, help="a tps or CSV file, also .gz")
+    parser.add_argument("--table", type=Path, help="a CSV file with a row for each specimen, for columns of its own")
+
+
+def settings(arguments):
+    """Those of `--quick` where it was asked for."""
+    if arguments.quick:
+        arguments.points, arguments.steps = min(arguments.points, 16), 3
+        arguments.warmup, arguments.samples = 30, 50
+    return arguments
+
+
+# %% [markdown]
+# ## The data
+# The tree is made one unit high: amplitudes say what happens between its root and the present. It sees a row for each
+# specimen of a species. The flow starts at its first split, around the mean that Brownian motion would have there given
+# the means of the species, by generalised least squares.
+
+
+# %%
+class Data(NamedTuple):
+    tree: nb.Tree  # of the species that were seen, with a row for each specimen
+    rows: np.ndarray  # (specimens, n, dim), NaN where a point is missing
+    means: dict[str, np.ndarray]  # of each species
+    start: np.ndarray  # (n, dim)
+
+    @property
+    def several(self):
+        """Whether a species has several specimens, so that something is known of the variation within."""
+        return len(self.rows) > len(self.means)
+
+
+def prepare(shapes, species, tree):
+    """`Data` from shapes `(N, n, dim)` in register, the species of each, and a tree."""
+    groups = {name: shapes[np.array([other == name for other in species])] for name in dict.fromkeys(species)}
+    tips = [tree.names[tip] for tip in tree.tips]
+    if not set(groups) <= set(tips):
+        tree.rows({name: group[0] for name, group in groups.items()})  # says what is wrong with the names
+    lacking = [name for name in tips if name not in groups]
+    if lacking:
+        print(f"tips without shapes, left out: {', '.join(map(str, lacking))}")
+    if len(groups) < 2:
+        raise ValueError(f"a tree needs shapes of at least two of its tips; got those of {', '.join(groups)}.")
+    tree = from_first_split(tree.pruned(groups))
+    tree = tree.scaled(1 / tree.height)
+    means = {name: np.nanmean(group, axis=0) for name, group in groups.items()}
+    start = mean_at_root(tree, np.stack([means[tree.names[tip]] for tip in tree.tips]))
+    tree = tree.observing(species)
+    return Data(tree, tree.rows(shapes, names=species), means, start)
+
+
+def from_first_split(tree):
+    """The tree without time before its first split, which nothing is known of."""
+    while tree.parents.count(0) == 1:
+        parents = [-1, *(parent - 1 for parent in tree.parents[2:])]
+        tree = nb.Tree(parents, tree.lengths[1:], tree.names[1:])
+    return tree
+
+
+def ancestry(tree):
+    """Whether a node, of the second axis, is another or on its way from the root."""
+    above = np.eye(tree.num_nodes, dtype=bool)
+    for node, parent in enumerate(tree.parents[1:], 1):
+        above[node] |= above[parent]
+    return above
+
+
+def mean_at_root(tree, rows):
+    """Generalised least squares: weights 1ᵀ C⁻¹, C being the time that two tips have in common."""
+    above = ancestry(tree)[list(tree.tips)]
+    shared = np.max(np.where(above[:, None] & above, tree.depths, 0.0), axis=-1)
+    weights = np.linalg.solve(shared + 1e-6 * np.eye(len(shared)), np.ones(len(shared)))
+    rows = np.where(np.isnan(rows), np.nanmean(rows, axis=0), rows)
+    return np.tensordot(weights / weights.sum(), rows, 1)
+
+
+# %% [markdown]
+# ## The model
+# The root is as far from that mean as the flow would come in the time of another tree, a priori; with `--fixed-root` it
+# is there. Where no species has two specimens nothing is known of the variation within, and its SD is given by `--sd`.
+
+
+# %%
+def parameters(several, sd):
+    amplitude = numpyro.sample("amplitude", dist.LogNormal(-2.0, 1.0))
+    length_scale = numpyro.sample("length_scale", dist.LogNormal(-1.0, 0.5))
+    within = numpyro.sample("within", dist.LogNormal(-4.0, 1.0)) if several else sd
+    return amplitude, length_scale, within
+
+
+def law_of(data, arguments, amplitude, length_scale, within):
+    space, seen = nb.Landmarks(*data.start.shape), np.isfinite(data.rows).all(axis=-1)
+    flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale))
+    if seen.all():
+        match, own = nb.InexactMatch.from_point_sd(within, space), ()
+    else:
+        match = jax.vmap(lambda points: nb.InexactMatch.from_point_sd(within, space, mask=points))(seen)
+        own = ("match",)
+    prior = {} if arguments.fixed_root else {"root_covariance": flow.covariance(0.0, data.start)}
+    return nb.DiffusionTree(flow, data.start, match, tree=data.tree, num_steps=arguments.steps, per_row=own, **prior)
+
+
+def model_of(data, arguments, sd):
+    def model(rows=None):
+        nb.sample("specimens", law_of(data, arguments, *parameters(data.several, sd)), obs=rows)
+
+    return model
+
+
+# %% [markdown]
+# ## Inference
+
+
+# %%
+def infer(data, arguments, sd):
+    """Posterior draws by chain, and results for ArviZ with the ancestors among the posterior."""
+    kernel = nb.infer.FunctionSpaceHMC(model_of(data, arguments, sd))
+    run = {"num_warmup": arguments.warmup, "num_samples": arguments.samples, "num_chains": 2 if arguments.quick else 4}
+    mcmc = MCMC(kernel, chain_method="vectorized", **run)
+    start, key = time.perf_counter(), jr.key(arguments.seed)
+    rows, fields = np.nan_to_num(data.rows), nb.infer.fields(kernel)
+    if arguments.run is None:
+        mcmc.run(key, rows, extra_fields=fields)
+    else:
+        nb.infer.run_checkpointed(mcmc, arguments.run, key, rows, extra_fields=fields, keep_noise=1)
+    samples = jax.block_until_ready(mcmc.get_samples(group_by_chain=True))
+    print(f"{time.perf_counter() - start:.0f} s for {run['num_chains']} chains of {arguments.warmup} + ", end="")
+    print(f"{arguments.samples} draws; divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
+    prior = Predictive(parameters, num_samples=2000)(jr.key(1), data.several, sd)
+    results = nb.to_arviz(mcmc, prior=prior)
+    results["posterior"]["ancestor"] = ancestors(data, arguments, sd, samples)
+    return {name: samples[name] for name in prior}, prior, results
+
+
+def ancestors(data, arguments, sd, samples):
+    """The inner nodes: a draw of the parameters and the noise is a draw of the paths, nothing is to be simulated."""
+    rows, inner = np.nan_to_num(data.rows), inner_nodes(data.tree, arguments)
+
+    def states(draw):
+        law = law_of(data, arguments, draw["amplitude"], draw["length_scale"], draw.get("within", sd))
+        return law.given(draw["specimens_noise"]).nodes(rows)[np.array(inner)]
+
+    shape = samples["specimens_noise"].shape[:2]
+    draws = {name: np.concatenate(values) for name, values in samples.items()}
+    found = jax.jit(lambda draws: jax.lax.map(states, draws))(draws)
+    dims = ("chain", "draw", "node", "point", "coordinate")
+    coords = {"node": [name_of(data.tree, node) for node in inner], "coordinate": list("xyz"[: data.start.shape[1]])}
+    return xr.DataArray(np.reshape(found, (*shape, *found.shape[1:])), dims=dims, coords=coords)
+
+
+def inner_nodes(tree, arguments):
+    """Numbers of the ancestors that are not known."""
+    return [node for node in range(int(arguments.fixed_root), tree.num_nodes) if node not in tree.tips]
+
+
+def name_of(tree, node):
+    """Its own, or by the first and the last tip below it."""
+    below = [tree.names[tip] for tip in tree.tips if ancestry(tree)[tip, node]]
+    return tree.names[node] or f"{below[0]}–{below[-1]}"
+
+
+def report(results, samples, prior):
+    names = list(samples)
+    print(az.summary(results, var_names=names).to_string())
+    for name in names:
+        before, after = np.std(prior[name]), np.std(samples[name])
+        print(f"{name}: prior SD {before:.4f}, posterior SD {after:.4f}, ratio {after / before:.2f}")
+    table = az.summary(results, var_names=["ancestor"])
+    worst, least = table["r_hat"].astype(float).max(), table["ess_bulk"].astype(float).min()
+    print(f"ancestors: {len(table)} coordinates, r_hat at most {worst:.3f}, bulk ESS at least {least:.0f}")
+
+
+# %% [markdown]
+# ## What is left behind: a NetCDF file and two figures
+# Outlines of posterior draws lie around the mean of each ancestor. They hold the uncertainty in parameters and paths,
+# not that in the tree.
+
+
+# %%
+def save(data, samples, prior, results, arguments, name):
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    written = [arguments.output / file for file in (f"{name}.nc", f"{name}_ladder.png", f"{name}_posterior.png")]
+    results.to_netcdf(str(written[0]), engine="h5netcdf")
+
+    def drawn(shapes):
+        magnified = data.start + arguments.magnify * (np.asarray(shapes) - data.start)
+        return magnified[..., :2]
+
+    draws = np.asarray(results["posterior"]["ancestor"])
+    draws = draws.reshape(-1, *draws.shape[2:])
+    bands = {node: drawn(draws[:, i]) for i, node in enumerate(inner_nodes(data.tree, arguments))}
+    means = {name: drawn(mean) for name, mean in data.means.items()}
+    size = np.clip(10 / len(means), 0.4, 1.0)  # inches
+    fixed = {0: drawn(data.start)} if arguments.fixed_root else {}
+    nb.plot.tree(data.tree, shapes=means | fixed, draws=bands, closed=not arguments.open, size=size)
+    plt.gca().set_xlabel("time since the root, in heights of the tree")
+    times = f", deviations × {arguments.magnify:g}" if arguments.magnify != 1 else ""
+    plt.gcf().suptitle(f"species, ancestors and draws of them{times}", fontsize="medium")
+    plt.savefig(written[1], dpi=150)
+    plt.close()
+    nb.plot.posterior({name: np.ravel(values) for name, values in samples.items()}, prior)
+    plt.gcf().suptitle("posterior, and prior (broken)", fontsize="medium")
+    plt.savefig(written[2], dpi=150)
+    plt.close()
+    print("written: " + ", ".join(str(path) for path in written))
+
+
+def analyse(data, arguments, name, sd=0.005):
+    """From data to files."""
+    between = np.nanstd(list(data.means.values()) - data.start)
+    residuals = data.rows - np.stack([data.means[name] for name in data.tree.observed_names])
+    free = np.sum(np.isfinite(data.rows)) * (1 - len(data.means) / len(data.rows))
+    within = np.sqrt(np.nansum(residuals**2) / free) if data.several else sd
+    print(f"{len(data.rows)} specimens of {len(data.means)} species, {len(data.start)} points: SD of a ", end="")
+    print(f"coordinate between species {between:.4f}, within {within:.4f}{'' if data.several else ' (given)'}")
+    samples, prior, results = infer(data, arguments, sd)
+    report(results, samples, prior)
+    save(data, samples, prior, results, arguments, name)
+
+
+# %% [markdown]
+# ## Files of your own
+
+
+# %%
+def read(arguments):
+    """Shapes `(N, n, dim)` in register, the species of each, and the tree."""
+    shapes, rows = read_shapes(arguments)
+    species = column_of(rows, arguments.names, "--names")
+    if not arguments.aligned:
+        shapes = nb.shapes.procrustes_align(shapes).shapes
+    kept = not arguments.blanks
+    return shapes, species, nb.Tree.from_newick(arguments.tree, index=arguments.index, preserve_underscores=kept)
+
+
+def read_shapes(arguments):
+    """Shapes `(N, n, dim)` as the file has them, NaN where a point is missing, and what it says of each, by column."""
+    file = arguments.shapes
+    tps = Path(file.stem if file.suffix == ".gz" else file.name).suffix.lower() == ".tps"
+    specimens = nb.io.read_tps(file) if tps else nb.io.read_csv(file)
+    rows = [{"id": specimen.id} | dict(specimen.notes) for specimen in specimens]
+    if arguments.table is not None:
+        opened = gzip.open if arguments.table.suffix == ".gz" else open
+        with opened(arguments.table, "rt", encoding="utf-8", newline="") as table:
+            rows = list(csv.DictReader(table))
+    if len(rows) != len(specimens):
+        raise ValueError(f"--table must have a row for each of {len(specimens)} specimens; got {len(rows)}.")
+    shapes = [np.concatenate([specimen.landmarks, *specimen.curves]) for specimen in specimens]
+    if len({len(shape) for shape in shapes}) > 1:
+        raise ValueError(f"{file}: all shapes must have the same points; got {sorted(set(map(len, shapes)))}.")
+    count = len(shapes[0])
+    num_points = min(arguments.points, count)
+    chosen = np.linspace(0, count - 1 if arguments.open else count, num_points, endpoint=arguments.open)
+    return np.stack(shapes)[:, np.round(chosen).astype(int)], rows
+
+
+def column_of(rows, column, option):
+    """What a column says of each specimen."""
+    known = [name for name in rows[0] if all(row.get(name) for row in rows)] if rows else []
+    if column not in known:
+        raise ValueError(f"{option} must be a column that every specimen has filled, one of {known}; got {column!r}.")
+    return [row[column] for row in rows]
+
+
+def main():
+    parser = options("Evolution of shape along a phylogeny.")
+    files(parser, required=True)
+    parser.add_argument("--tree", type=Path, required=True, help="a Newick or NEXUS file")
+    parser.add_argument("--names", default="id", help="the column or key with the species, as in the tree")
+    parser.add_argument("--index", type=int, help="which of several trees, from 0 on")
+    parser.add_argument("--blanks", action="store_true", help="underscores in names of the tree are blanks")
+    parser.add_argument("--aligned", action="store_true", help="shapes are in register, and are taken as they are")
+    parser.add_argument("--sd", type=float, default=0.005, help="of a coordinate, where no species has two specimens")
+    arguments = settings(parser.parse_args())
+    try:
+        data = prepare(*read(arguments))
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
+    analyse(data, arguments, "phylogeny", arguments.sd)
+
+
+if __name__ == "__main__":
+    main()
