@@ -138,11 +138,12 @@ class Condition:
 class Guide:
     """`auxiliary` None: linearised at the reference. `receding`: the weight of the end, or None if frozen.
 
-    `learned(t, x, reference, ts)` is what a network adds to the score.
+    `geodesic`: the part of the correction. `learned(t, x, reference, ts)` is what a network adds to the score.
     """
 
     auxiliary: Process | None = None
     receding: float | None = None
+    geodesic: float = 0.0
     euler: bool = False
     dense: bool = True
     unguided: bool = False
@@ -190,6 +191,37 @@ class Problem:
         assert Lam.shape == (len(L), n)
         return Lam, s, M
 
+    def miss(self, k, x, v):
+        """By how much the Hamiltonian path of the receding momentum misses v: one midpoint step to the end."""
+        Lam, s, S = self.forecast(k, x, k)
+        t, left, L = self.ts[k], self.ts[-1] - self.ts[k], self.condition.L
+        r = v - Lam @ x - s
+        momentum = np.linalg.solve(S, r)
+
+        def energy(x, p):
+            return np.sum(p * self.process.drift(t, x)) + 0.5 * np.sum(p * (self.process.covariance(t, x) @ p))
+
+        def slopes(x, p):
+            dx, h = np.zeros_like(x), 1e-3
+            for i in np.ndindex(*x.shape):
+                e = np.zeros_like(x)
+                e[i] = h
+                near, far = (energy(x + m * e, p) - energy(x - m * e, p) for m in (1, 2))
+                dx[i] = (8 * near - far) / (12 * h)
+            return dx, self.process.drift(t, x) + self.process.covariance(t, x) @ p
+
+        p = Lam.T @ momentum
+        dp, dx = slopes(x, p)
+        dp, dx = slopes(x + left / 2 * dx, p - left / 2 * dp)
+        x, p = x + left * dx, p - left * dp
+        places = [int(np.argmax(row)) for row in L]
+        if np.array_equal(L, np.eye(L.shape[1])[places]) and places == sorted(places):  # points, not combinations
+            momentum = L @ p
+        noise = 0.0 if self.condition.noise is None else self.condition.noise @ momentum
+        miss = v - L @ x - noise
+        excess = np.sum(miss * np.linalg.solve(S, miss)) / np.sum(r * np.linalg.solve(S, r))
+        return miss / (1 + (excess / 2) ** 2)
+
     def replay(self, z):
         """The path and its log weight, Σ log p(u)/q(u) + log p(v | ...), every law dense."""
         condition, x, ts = self.condition, self.x0, self.ts
@@ -206,7 +238,8 @@ class Problem:
                 M = np.zeros((len(v), len(v))) if condition.noise is None else condition.noise
             else:
                 Lam, s, M = self.forecast(k + 1, x, k)
-            mu, cov, B, total = conditional(sigma, m, Lam, s, M, v, exact=last and condition.noise is None)
+            target = v if last or not self.guide.geodesic else v + self.guide.geodesic * self.miss(k, x, v)
+            mu, cov, B, total = conditional(sigma, m, Lam, s, M, target, exact=last and condition.noise is None)
             if self.guide.euler and not last:
                 B, cov = np.eye(len(B)), np.eye(len(B))
             if self.guide.learned is not None and not last:

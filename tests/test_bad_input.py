@@ -269,6 +269,7 @@ def table() -> dict[str, Row]:
         # guides and bridges
         "FrozenGuide": row(nb.FrozenGuide, auxiliary=("linear?", OU)),
         "RecedingGuide": row(nb.RecedingGuide, end_weight=("number", 0.5)),
+        "GeodesicGuide": row(nb.GeodesicGuide, correction=("number", 0.5), end_weight=("number", 0.5)),
         "DriftGuide": row(nb.DriftGuide, guide=("guide", nb.FrozenGuide())),
         "ScoreGuide": row(
             nb.ScoreGuide,

@@ -117,6 +117,7 @@ GUIDES = {
     "auxiliary": (lambda: nb.FrozenGuide(nb.LinearSDE(*AUX)), AUX),
     "receding": (nb.RecedingGuide, Guide(receding=0.0)),
     "receding-mixed": (lambda: nb.RecedingGuide(end_weight=0.2), Guide(receding=0.2)),
+    "geodesic": (nb.GeodesicGuide, Guide(receding=0.1, geodesic=0.75)),
     "drift": (lambda: nb.DriftGuide(nb.FrozenGuide()), Guide(euler=True)),
     "drift-receding": (lambda: nb.DriftGuide(nb.RecedingGuide()), Guide(euler=True, receding=0.0)),
     "unguided": (nb.scores.Unguided, Guide(unguided=True)),
@@ -158,7 +159,7 @@ def problem(sde_name, condition_name, guide_name):
         exact_steps = process.linear is not None
         guide = Guide(auxiliary=linear_process(*AUX, 3, columns(x0).shape[1], exact=exact_steps))
     if sde_name in CONSTANT or sde_name == "user-time":
-        guide = replace(guide, receding=None)  # the receding guide of a constant covariance is frozen
+        guide = replace(guide, receding=None, geodesic=0.0)  # the receding guide of a constant covariance is frozen
     if guide_name.startswith("learned"):
         guide = replace(guide, learned=network_score(sde, process))
     bridge = nb.GuidedBridge(sde, condition, x0=x0, ts=TS, guide=make())
@@ -297,7 +298,7 @@ def test_default_guide_and_grid():
     assert isinstance(bridge.guide, nb.FrozenGuide) and bridge.num_steps == 4
     np.testing.assert_allclose(bridge.ts, [0.5, 1.0, 1.5, 2.0, 2.5])
     bridge = nb.GuidedBridge(curved, nb.ExactMatch().at(V), x0=X3, t0=0.5, t1=2.5, num_steps=np.int64(4))
-    assert isinstance(bridge.guide, nb.RecedingGuide) and bridge.noise_shape == (4, 3, 1)
+    assert isinstance(bridge.guide, nb.GeodesicGuide) and bridge.noise_shape == (4, 3, 1)
     s = np.linspace(0, 1, 5)
     np.testing.assert_allclose(bridge.ts, 0.5 + 2 * s * (2 - s))
     other = bridge.with_guide(nb.FrozenGuide())

@@ -350,6 +350,7 @@ BRIDGES = [
         r"`auxiliary` must",
     ),
     ("end-weight", lambda: nb.RecedingGuide(1.5), "`end_weight` must be a number from 0 to 1; got 1.5"),
+    ("correction", lambda: nb.GeodesicGuide(-0.5), "`correction` must be a number from 0 to 1; got -0.5"),
     ("end-weights", lambda: nb.RecedingGuide([0.1, 0.2]), r"`end_weight` must be a number.*\[0.1, 0.2\]"),
     (
         "solver-stratonovich",

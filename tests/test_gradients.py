@@ -140,6 +140,7 @@ PAIR = {"x0": COINCIDENT, "observed": COINCIDENT}
 MATRIX = np.array([[1.0, 0.2], [0.2, 0.6]])
 FEW = {name: PLAIN[name] for name in ("x0", "observed", "t1")}
 RATE = {"drift": 0.0, "diffusion": 0.7}
+STILL = {"observed": TRIANGLE, "length_scale": 0.9}
 JITTER = {"weights": np.ones(3), "jitter": 0.0}
 
 
@@ -153,6 +154,10 @@ def unguided(p):
 
 def receding(p):
     return nb.RecedingGuide(p["end_weight"])
+
+
+def geodesic(p):
+    return nb.GeodesicGuide(p["correction"], p["end_weight"])
 
 
 def exact(p):
@@ -197,6 +202,8 @@ CASES = {
     "times": (clocked, inexact, no_guide, CLOCK | {"ts": np.array([0.4, 1.0, 1.3])}),
     "interval": (clocked, inexact, no_guide, CLOCK | {"t0": 0.4, "t1": 1.3}),
     "bins": (linear, bins, no_guide, FEW | RATE | CUTS),
+    "geodesic": (flow, inexact, geodesic, SHAPES | {"length_scale": 0.9, "end_weight": 0.1, "correction": 0.75}),
+    "geodesic, straight": (flow, inexact, geodesic, SHAPES | STILL | {"end_weight": 0.0, "correction": 1.0}),
     "flow": (flow, inexact, receding, SHAPES | {"length_scale": 0.9, "end_weight": 0.0}),
     "no jitter": (jittered, inexact, receding, SHAPES | JITTER | {"end_weight": 1.0}),
     "sum of kernels": (sum_of_kernels, inexact, receding, SHAPES | MIXED),

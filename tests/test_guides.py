@@ -25,6 +25,7 @@ GUIDES = {
     "auxiliary": nb.FrozenGuide(nb.LinearSDE(-0.3, 0.65, 0.1)),  # ã below a(v) = 0.41 would give heavy tails
     "receding": nb.RecedingGuide(),
     "receding-mixed": nb.RecedingGuide(end_weight=0.2),
+    "geodesic": nb.GeodesicGuide(),
     "drift": nb.DriftGuide(nb.FrozenGuide()),
     "learned": nb.scores.ScoreGuide(
         nb.FrozenGuide(), lambda t, x, v, theta: 0.3 * jnp.sin(3 * x) + 0.2 * t, Standard(*map(jnp.asarray, STANDARD))

@@ -249,6 +249,7 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
     ),
     "FrozenGuide": (nb.FrozenGuide, {"auxiliary": Of(lambda t: nb.LinearSDE(-0.3 * t, 0.4))}, led_by),
     "RecedingGuide": (nb.RecedingGuide, {"end_weight": times(0.3)}, led_by),
+    "GeodesicGuide": (nb.GeodesicGuide, {"correction": times(0.6), "end_weight": times(0.3)}, led_by),
     "DriftGuide": (nb.DriftGuide, {"guide": Of(lambda t: nb.RecedingGuide(0.3 * t))}, led_by),
     "ScoreGuide": (nb.ScoreGuide, LEARNED | {"history": {}, "held": network}, led_by),
     "Unguided": (nb.Unguided, {}, led_by),

@@ -20,12 +20,10 @@ import jax
 import jax.numpy as jnp
 
 from .._checks import as_float, require
-from .._linalg import apply, cholesky, solve_lower, transpose
+from .._linalg import apply, cholesky, filled, solve_lower, transpose, without_variance
 from .._types import State, Structured
 from ..sdes import AbstractSDE
 from ._guides import AbstractGuide, AbstractPlan, FrozenGuide, RecedingGuide, RecedingPlan
-
-_TINY = 1e-30
 
 
 class GeodesicGuide(AbstractGuide):
@@ -96,7 +94,7 @@ class _GeodesicPlan(AbstractPlan):
         """By how much the path of the receding momentum misses what is observed, and S⁻¹."""
         step, t, left = entry
         operator, shift, covariance = self.receding.forecast(step, a)
-        factor = cholesky(covariance)
+        factor = cholesky(filled(covariance, without_variance(covariance)))
 
         def solve(r):
             return solve_lower(factor, solve_lower(factor, r), transposed=True)
@@ -116,7 +114,8 @@ class _GeodesicPlan(AbstractPlan):
         if L.ndim < 2:
             momentum = apply(jnp.where(L == 0, 0.0, 1 / jnp.where(L == 0, 1.0, L)), p)
         miss = observed - apply(L, x) - apply(noise, momentum)
-        excess = jnp.sum(miss * solve(miss)) / (jnp.sum(r * solve(r)) + _TINY)
+        to_go = jnp.sum(r * solve(r))
+        excess = jnp.where(to_go > 0, jnp.sum(miss * solve(miss)) / jnp.where(to_go > 0, to_go, 1.0), 0.0)
         return miss / (1 + (0.5 * excess) ** 2), solve
 
 
