@@ -134,6 +134,44 @@ def test_linear_processes_have_the_dense_normal(name, count):
         np.testing.assert_allclose(slopes[key], true_slopes[key], rtol=1e-6, atol=1e-6 * size, err_msg=key)
 
 
+class Still(nb.KunitaFlow):
+    """A flow whose field does not move with its landmarks, unknown to the library: its covariance is that at X0."""
+
+    def noise(self, t, x):
+        return super().noise(t, jnp.asarray(X0) + 0 * x)
+
+
+@pytest.mark.parametrize("guide", [nb.RecedingGuide(), nb.GeodesicGuide()], ids=["receding", "geodesic"])
+@pytest.mark.parametrize("seen", ["all", "some", "exact"])
+def test_what_follows_is_the_message_of_a_constant_covariance(seen, guide):
+    """Every log weight is the dense normal's; to 1e-8, or 1e-5 where points are missing, for rounding's sake."""
+    tree = random_tree(5, 14, zeros=seen != "exact")
+    tips = [tree.names[tip] for tip in tree.tips]
+    tree = tree.observing(tips if seen == "exact" else ["n13", "n12", "n11", "n10", "n9", "n4"])
+    m = len(tree.observed)
+    rng = np.random.default_rng(1)
+    data, errors, mask = rng.normal(size=(m, 3, 2)), rng.uniform(0.02, 0.3, m), rng.random((m, 3)) < 0.7
+    flow = Still(nb.Landmarks(3, 2, weights=1.0), nb.GaussianKernel(0.7, 0.6))
+    a = flow.covariance(0.0, X0)
+    match, rows = jax.vmap(nb.InexactMatch)(errors), np.ones((m, 3), bool)
+    if seen == "some":
+        match, rows = jax.vmap(lambda error, mask: nb.InexactMatch(error, mask=mask))(errors, mask), mask
+    if seen == "exact":
+        law = nb.DiffusionTree(flow, X0, nb.ExactMatch(), tree=tree, num_steps=3, guide=guide)
+        errors = np.zeros(m)
+    else:
+        law = nb.DiffusionTree(flow, X0, match, tree=tree, num_steps=3, guide=guide, per_row=("match",))
+    z = jr.normal(jr.key(0), (3, *law.noise_prior().shape()))
+    found = jax.jit(jax.vmap(lambda z: law.given(z).log_prob(data)))(z)
+
+    covariance = np.kron(shared_times(tree), a) + np.diag(np.repeat(errors, 3))
+    kept = rows.ravel()
+    normal = stats.multivariate_normal(None, covariance[np.ix_(kept, kept)])
+    truth = sum(normal.logpdf((data - X0)[..., j].ravel()[kept]) for j in range(2))
+    tolerance = 1e-5 if seen == "some" else 1e-8
+    np.testing.assert_allclose(found, truth, rtol=tolerance, atol=tolerance)
+
+
 def test_a_thousand_tips():
     """Beside a pruning that is written here for one number per tip."""
     tree = random_tree(3, 2600, zeros=False)
