@@ -20,6 +20,7 @@ from .guiding import (
     AbstractGuide,
     AbstractPlan,
     GuidedStep,
+    GuidedTerm,
     arrive,
     default_guide,
     exact_message,
@@ -389,6 +390,31 @@ class GuidedBridge(eqx.Module):
         if self.condition.exact:  # to the last digit
             path = path.at[-1].set(self.condition.reference(self.sde, path[-1]))
         return jnp.concatenate([self.x0[None], path]), log_weight + target.log_weight
+
+    @full_precision
+    def guided_terms(
+        self, noise: Float[Array, "K k dim"]
+    ) -> tuple[GuidedTerm, Float[Array, " K"], Float[Array, "K+1 n *dim"]]:
+        """What `diffrax.diffeqsolve` solves by `GuidedStep()`: every step but the last, which is onto the observation.
+
+            terms, ts, origins = bridge.guided_terms(noise)
+            start = (bridge.x0 - origins[0], 0.0)
+            diffrax.diffeqsolve(terms, nb.GuidedStep(), ts[0], ts[-1], None, start,
+                                stepsize_controller=diffrax.StepTo(ts))
+
+        **Returns:** the terms, times that have elapsed, `(K,)`, and the origins of which states are displacements, at
+        all times of the grid. The solution is the displacement of the last state but one, and its log weight.
+
+        **Errors:** `ValueError` for a set, whose target is drawn, and for a bridge with another `solver`.
+        """
+        require(self._is_discrete, "`guided_terms` needs the guided step: the default `solver`.")
+        _, noise = self._split(noise)
+        frame, condition, _, _, ts = problem = self.problem()
+        require(condition.num_extra_noises == 0, "`condition` is a set, whose target `guided_terms` does not draw.")
+        plan = self._plan(problem)
+        assert plan is not None
+        observed = self._target(problem, plan, noise[:0]).value
+        return GuidedTerm.of(frame.sde, plan, observed, ts[:-1], noise[:-1]), ts[:-1], frame.origins
 
     def noise_from_path(
         self, path: Float[Array, "K+1 n *dim"], key: PRNGKeyArray | None = None

@@ -14,7 +14,8 @@ from helpers import columns, columns_of_path, conditional, exact_affine, jacobia
 from models import CURVE, SDES, X3
 
 import numpyro_bridges as nb
-from numpyro_bridges.guiding import GridNoise as NoisePath
+from numpyro_bridges.distributions._tree import _problem
+from numpyro_bridges.guiding import GridNoise as NoisePath, GuidedTerm, arrive
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
@@ -264,5 +265,55 @@ def test_the_covariance_must_match_at_an_exact_end():
 def test_guides_without_one_auxiliary_process():
     with pytest.raises(ValueError, match="RecedingGuide has none. Use `guide=FrozenGuide"):
         bridge(nb.InexactMatch(0.1), nb.RecedingGuide())
-    with pytest.raises(ValueError, match="RecedingGuide has none"):
+    with pytest.raises(ValueError, match="GeodesicGuide has none"):
         bridge(nb.InexactMatch(0.1), None)
+
+
+# The guided step under diffrax's own loop.
+
+
+def by_diffrax(terms, ts, start):
+    """States after `start` and the log weight of the steps between `ts`."""
+    solution = diffrax.diffeqsolve(
+        terms, nb.GuidedStep(), ts[0], ts[-1], None, (start, jnp.zeros(())),
+        stepsize_controller=diffrax.StepTo(ts), saveat=diffrax.SaveAt(ts=ts[1:]),
+    )  # fmt: skip
+    assert solution.ys is not None
+    return solution.ys[0], solution.ys[1][-1]
+
+
+@pytest.mark.parametrize("name, exact", [("kunita-landmark", False), ("user-square", True), ("linear-matrix", False)])
+def test_a_guided_bridge_is_what_diffrax_solves(name, exact, key):
+    """The same path and log weight, but for the last step, which is onto what is observed."""
+    sde, _, x0 = SDES[name]()
+    ts = np.array([0.1, 0.3, 0.7, 1.0])
+    match = nb.ExactMatch() if exact else nb.InexactMatch(0.05)
+    bridge = nb.GuidedBridge(sde, match.at(0.5 - 0.3 * x0), x0=x0, ts=ts)
+    z = jr.normal(key, bridge.noise_shape)
+    terms, times, origins = bridge.guided_terms(z)
+    states, log_weight = by_diffrax(terms, times, x0 - origins[0])
+    frame, _, seen, _, elapsed = bridge.problem()
+    noise = z[-1, :, 0] if x0.ndim == 1 else z[-1]
+    end, log_density = arrive(frame.sde, seen, elapsed, states[-1], noise, terms.observed)
+
+    path, total = bridge.path_and_log_weight(z)
+    np.testing.assert_allclose(total, log_weight + log_density, rtol=1e-10)
+    states = origins[1:] + jnp.concatenate([states, end[None]])
+    np.testing.assert_allclose(path[1:], states, rtol=1e-10, atol=1e-12)
+
+
+def test_a_branch_of_a_tree_is_what_diffrax_solves(key):
+    """An inner branch of a flow's tree, from the root: all of its steps."""
+    sde, _, x0 = SDES["kunita-landmark"]()
+    tree = nb.Tree.from_newick("((a:0.4,b:0.6)x:0.5,c:1);")
+    law = nb.DiffusionTree(sde, x0, nb.InexactMatch(0.05), tree=tree, num_steps=3)
+    data = x0[None] + 0.2 * jr.normal(key, (3, *x0.shape))
+    z = jr.normal(key, law.noise_prior().shape())
+    problem = _problem(law.parts, data)
+    up = problem.up()
+    branch, plan, value = jax.tree.map(lambda a: a[0], (problem._of(problem.schedule.inner), up.plans, up.data))
+    ts = problem._grid(branch.length, False)
+    terms = GuidedTerm.of(problem._edge(branch), plan, value, ts, z[:3])
+    states, log_weight = by_diffrax(terms, ts, x0 - branch.anchor)
+    np.testing.assert_allclose(law.given(z).path(data)[0, 1:], branch.anchor[None] + states, rtol=1e-10)
+    np.testing.assert_allclose(law.given(z)._log_prob_by_block(data)[0], log_weight, rtol=1e-10)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -52,7 +53,11 @@ class GridNoise(diffrax.AbstractBrownianPath):
 
 
 class GuidedTerm(diffrax.AbstractTerm):
-    """What `GuidedStep` steps: an SDE, a plan (`step(t0)`: its entry at the step's end), the target, noise."""
+    """What `GuidedStep` steps: an SDE, a plan (`step(t0)`: its entry at the step's end), the target, noise.
+
+    The product with a step's noise is what the step leads to, not an increment: near an exact end, to which states are
+    displacements, sums of increments would lose its digits.
+    """
 
     sde: AbstractSDE
     plan: AbstractPlan
@@ -60,15 +65,29 @@ class GuidedTerm(diffrax.AbstractTerm):
     observed: State
     control: diffrax.AbstractPath
 
+    @classmethod
+    def of(cls, sde: AbstractSDE, plan: AbstractPlan, observed: State, ts: Array, noise: Array) -> "GuidedTerm":
+        """On a grid, each of whose times has an entry in the plan."""
+        control = GridNoise(ts=ts, noise=noise)
+
+        def step(t0):
+            return jax.tree.map(lambda a: a[control.index(t0) + 1], plan.steps)
+
+        return cls(sde, plan, step, observed, control)
+
     def vf(self, t, y, args):
-        raise NotImplementedError("A guided step has a Gaussian law and no vector field; use `GuidedStep()`.")
+        return y
 
     def contr(self, t0, t1, **kwargs):
         dt = t1 - t0
-        return self.control.evaluate(t0, t1) / jnp.sqrt(jnp.where(dt == 0, 1.0, dt))  # a step may have no length
+        z = self.control.evaluate(t0, t1) / jnp.sqrt(jnp.where(dt == 0, 1.0, dt))  # a step may have no length
+        return t0, t1, z, self.step(t0)
 
     def prod(self, vf, control):
-        raise NotImplementedError("A guided step has a Gaussian law and no vector field; use `GuidedStep()`.")
+        (x, log_weight), (t0, t1, z, planned) = vf, control
+        transition = self.sde.transition(t0, t1, x)
+        u, step_weight = self.plan.steer(planned, transition, t1 - t0, x, self.observed).drive(z)
+        return transition.mean + apply(transition.factor, u), log_weight + step_weight
 
 
 class GuidedStep(diffrax.AbstractItoSolver):
@@ -90,12 +109,7 @@ class GuidedStep(diffrax.AbstractItoSolver):
         return None
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        x, log_weight = y0
-        transition = terms.sde.transition(t0, t1, x)
-        steering = terms.plan.steer(terms.step(t0), transition, t1 - t0, x, terms.observed)
-        z = terms.contr(t0, t1)
-        u, step_weight = steering.drive(z)
-        y1 = (transition.mean + apply(transition.factor, u), log_weight + step_weight)
+        y1 = terms.prod(terms.vf(t0, y0, args), terms.contr(t0, t1))
         return y1, None, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
 
     def func(self, terms, t0, y0, args):
