@@ -298,6 +298,7 @@ def table() -> dict[str, Row]:
         "GuidedBridge.noise_from_path": row(
             BRIDGE.noise_from_path, path=("array", PATH), key="key?"
         ),
+        "GuidedBridge.guided_terms": row(BRIDGE.guided_terms, noise=("array", NOISE)),
         "GuidedBridge.scores": row(BRIDGE.scores, path=("array", PATH)),
         "GuidedBridge.log_h": row(BRIDGE.log_h, t=("number", 0.5), x=("array", X)),
         "GuidedBridge.score": row(BRIDGE.score, t=("number", 0.5), x=("array", X)),

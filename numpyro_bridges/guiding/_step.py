@@ -61,7 +61,7 @@ class GuidedTerm(diffrax.AbstractTerm):
 
     sde: AbstractSDE
     plan: AbstractPlan
-    step: Callable[[RealScalar], Any]
+    step: Callable[[Any], Any]
     observed: State
     control: diffrax.AbstractPath
 
