@@ -175,7 +175,8 @@ def flow_model(num_points, num_steps):
         amplitude = numpyro.sample("amplitude", dist.LogNormal(-1.0, 0.3))
         circle = np.stack([np.cos(ANGLES(num_points)), np.sin(ANGLES(num_points))], 1)
         flow = nb.KunitaFlow(nb.Landmarks(num_points, 2), nb.GaussianKernel(amplitude, 0.6))
-        law = nb.DiffusionEndpoint(flow, circle, nb.InexactMatch(0.01), t1=1.0, num_steps=num_steps)
+        match, guide = nb.InexactMatch(0.01), nb.RecedingGuide()
+        law = nb.DiffusionEndpoint(flow, circle, match, t1=1.0, num_steps=num_steps, guide=guide)
         nb.sample("shape", law, obs=data)
 
     angles = ANGLES(num_points)
