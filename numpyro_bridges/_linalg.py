@@ -68,6 +68,11 @@ def apply(A: Structured, x: State) -> State:
     return rows(A, x) * x if A.ndim == 1 else A @ x
 
 
+def product(A: Array, B: Array) -> Array:
+    """A B of matrices; without a `dot` where A is small, so that a batch of products is one loop over all entries."""
+    return jnp.sum(A[:, :, None] * B[None], axis=1) if A.shape[0] <= 4 else A @ B
+
+
 def transpose(A: Structured) -> Structured:
     """Aᵀ."""
     return A.T

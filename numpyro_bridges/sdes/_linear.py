@@ -19,6 +19,7 @@ from .._linalg import (
     apply,
     compose,
     congruence,
+    product,
     promote,
     semidefinite_cholesky,
     symmetric,
@@ -60,8 +61,8 @@ def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array
 
     def series(carry, j):
         power, term, terms, totals = carry
-        power, term = A @ power / j, A @ term / (j + 1)
-        rate = A @ terms / (j + 1)
+        power, term = product(A, power) / j, product(A, term) / (j + 1)
+        rate = product(A, terms) / (j + 1)
         terms = rate + rate.T
         E, shift, S = totals
         return (power, term, terms, (E + power, shift + term, S + terms)), None
@@ -72,8 +73,8 @@ def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array
 
     def double(totals, i):
         E, shift, S = totals
-        ES = E @ S
-        doubled = (2 * E + E @ E, 2 * shift + E @ shift, 2 * S + ES + ES.T + ES @ E.T)
+        ES = product(E, S)
+        doubled = (2 * E + product(E, E), 2 * shift + product(E, shift), 2 * S + ES + ES.T + product(ES, E.T))
         return jax.tree.map(lambda new, old: jnp.where(i < k, new, old), doubled, totals), None
 
     (E, shift, S), _ = jax.lax.scan(double, totals, jnp.arange(_DOUBLINGS, dtype=B.dtype))
