@@ -135,13 +135,16 @@ class FrozenGuide(AbstractGuide):
     def moves(self):
         return self.auxiliary is None
 
-    def plan(self, sde, seen, reference, ts):
-        return _FrozenPlan(backward_filter(self._steps(sde, reference, ts), seen), seen.exact)
+    def plan(self, sde, seen, reference, ts, steps: AffineStep | None = None):
+        steps = self.steps(sde, reference, ts) if steps is None else steps
+        return _FrozenPlan(backward_filter(steps, seen), seen.exact)
 
-    def _steps(self, sde, reference, ts) -> AffineStep:
-        if self.auxiliary is None:
+    def steps(self, sde: Displaced, reference: State, ts) -> AffineStep:
+        """The steps of the auxiliary process, of which a plan may be told if they are known."""
+        auxiliary = self.auxiliary
+        if auxiliary is None:
             return jax.vmap(lambda s, t: sde.linearised_step(s, t, reference))(ts[:-1], ts[1:])
-        return jax.vmap(lambda s, t: sde.auxiliary_step(self.auxiliary, s, t, reference))(ts[:-1], ts[1:])
+        return jax.vmap(lambda s, t: sde.auxiliary_step(auxiliary, s, t, reference))(ts[:-1], ts[1:])
 
     def auxiliary_process(self, sde, reference, t1):
         process = sde if self.auxiliary is None else sde.alongside(self.auxiliary)

@@ -32,7 +32,7 @@ from .._linalg import apply, cholesky, full_precision, solve_lower, varying_like
 from .._types import State
 from ..conditioning import AbstractCondition, GaussianMessage, Observation, lift
 from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, arrive, default_guide, retrace, retrace_arrival, travel
-from ..sdes import AbstractSDE, BrownianMotion, Displaced
+from ..sdes import AbstractSDE, AffineStep, BrownianMotion, Displaced
 from ._root import Root
 from ._schedule import Schedule, schedule
 from ._told import Told, as_seen, earlier, nothing_told, told_by
@@ -80,6 +80,8 @@ class Branch(NamedTuple):
     parent_anchor: State
     own: AbstractSDE | None = None
     """The arrays of an SDE of its own; `None` where all branches have the same."""
+    steps: AffineStep | None = None
+    """For a guide that is frozen, the process linearised, on the grid of an inner branch."""
 
 
 class UpwardPass(NamedTuple):
@@ -324,7 +326,22 @@ class TreeProblem(eqx.Module):
     def _inner_plan(self, branch: Branch, seen: Observation, reference: State, *beyond) -> AbstractPlan:
         """With an entry at the end too: the last step to an inner node is led like the others."""
         ts = self._grid(branch.length, False)
-        return self.guide.plan(self._edge(branch), seen, reference, jnp.concatenate([ts, ts[-1:]]), *beyond)
+        ts, edge = jnp.concatenate([ts, ts[-1:]]), self._edge(branch)
+        if isinstance(self.guide, FrozenGuide):
+            return self.guide.plan(edge, seen, reference, ts, branch.steps)
+        return self.guide.plan(edge, seen, reference, ts, *beyond)
+
+    def _with_steps(self) -> "TreeProblem":
+        """With all that can be known of branches before any message, in one program for all of them."""
+        guide = self.guide
+        if not isinstance(guide, FrozenGuide):
+            return self
+
+        def of(branch):
+            ts = self._grid(branch.length, False)
+            return guide.steps(self._edge(branch), jnp.zeros_like(self.x0), jnp.concatenate([ts, ts[-1:]]))
+
+        return replace(self, branches=self.branches._replace(steps=jax.vmap(of)(self.branches)))
 
     def _start_message(self, plan, branch: Branch, observed: State) -> Information:
         """What the branch tells its parent, as a displacement from the parent's anchor."""
@@ -376,7 +393,7 @@ class TreeProblem(eqx.Module):
             return message._replace(c=message.c + c), (plan, w)
 
         own = self._own_messages(nothing(self.x0), jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
-        at_root, (plans, data) = self._summed_up(own, joined)
+        at_root, (plans, data) = self._with_steps()._summed_up(own, joined)
         return UpwardPass(plans, data, ends, at_root)
 
     def _up_with_means(self, ends: Led) -> UpwardPass:
