@@ -33,7 +33,7 @@ GUIDES = {
     "RecedingGuide(0.1)": (nb.RecedingGuide(0.1), None),
     "GeodesicGuide()": (nb.GeodesicGuide(), None),
     "GeodesicGuide(end_weight=0)": (nb.GeodesicGuide(end_weight=0.0), None),
-    "GeodesicGuide(end_weight=0.2)": (nb.GeodesicGuide(end_weight=0.2), None),
+    "GeodesicGuide(end_weight=0.1)": (nb.GeodesicGuide(end_weight=0.1), None),
     "DriftGuide(RecedingGuide())": (nb.DriftGuide(nb.RecedingGuide()), None),
     "FrozenGuide(), continuous Euler weight": (nb.FrozenGuide(), diffrax.Euler()),
 }

@@ -117,7 +117,7 @@ GUIDES = {
     "auxiliary": (lambda: nb.FrozenGuide(nb.LinearSDE(*AUX)), AUX),
     "receding": (nb.RecedingGuide, Guide(receding=0.0)),
     "receding-mixed": (lambda: nb.RecedingGuide(end_weight=0.2), Guide(receding=0.2)),
-    "geodesic": (nb.GeodesicGuide, Guide(receding=0.1, geodesic=0.75)),
+    "geodesic": (nb.GeodesicGuide, Guide(receding=0.2, geodesic=0.75)),
     "drift": (lambda: nb.DriftGuide(nb.FrozenGuide()), Guide(euler=True)),
     "drift-receding": (lambda: nb.DriftGuide(nb.RecedingGuide()), Guide(euler=True, receding=0.0)),
     "unguided": (nb.scores.Unguided, Guide(unguided=True)),

@@ -43,7 +43,7 @@ class GeodesicGuide(AbstractGuide):
     correction: Structured
     receding: RecedingGuide
 
-    def __init__(self, correction=0.75, end_weight=0.1):
+    def __init__(self, correction=0.75, end_weight=0.2):
         self.correction = as_float(correction, "correction")
         require(
             (self.correction.ndim == 0) and (0 <= self.correction) & (self.correction <= 1),

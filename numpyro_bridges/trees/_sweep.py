@@ -6,8 +6,9 @@ What is seen below a node is told to the branch above it by a Gaussian message
 
 o being the node's anchor, near which coefficients are linearised. Where branches meet messages are multiplied: H, F and
 c are added, the normalising constants too. A branch is guided like a bridge: one that leads to an end by the
-observation there, one that leads to an inner node by its message, which is an observation R x + N(0, I) with R Rᵀ = Hᵀ.
-With every step of every branch guided by some q,
+observation there, one that leads to an inner node by its message, which is an observation Rᵀ x + N(0, I) with R Rᵀ = H.
+A guide that follows the state is told of a mean at a later time instead (`_told.py`). With every step of every branch
+guided by some q,
 
     Ψ = Σ_branches Σ_k [log p − log q](x_{k+1} | x_k) + Σ_{seen nodes} log p(v | x),
     E exp Ψ = p(all data | x_root),
@@ -54,7 +55,7 @@ class Information(NamedTuple):
         return Information(*(a + b for a, b in zip(self, other, strict=True)))
 
     def as_observation(self) -> tuple[Observation, State, Float[Array, ""]]:
-        """The same as an observation w = R y + N(0, I), and the log density that it has too much."""
+        """The same as an observation w = Rᵀ y + N(0, I), and the log density that it has too much."""
         n, dtype = self.H.shape[0], self.H.dtype
         nugget = _NUGGET if dtype == jnp.float64 else 1e-6
         diagonal = jnp.diagonal(self.H)
