@@ -3,9 +3,9 @@
     python benchmarks/guided_weight.py [--quick] [--x64] [--sizes 8 32 128] [--memory]
 
 One Kunita flow of n landmarks, 100 steps, 64 paths, the receding guide: value, and gradient with respect to the noise,
-the amplitude and the length scale. One JSON line per size: run times (minimum over repeats, the two programs in turn),
-their ratios, compile times, flops by XLA's cost analysis. Last the peak memory of one gradient at 256 landmarks, in a
-process of its own.
+the amplitude and the length scale; beside them the library's geodesic guide. One JSON line per size: run times (minimum
+over repeats, the programs in turn), their ratios, compile times, flops by XLA's cost analysis. Last the peak memory of
+one gradient at 256 landmarks, in a process of its own.
 """
 
 import argparse
@@ -31,16 +31,16 @@ def shapes(n: int):
     return np.stack([np.cos(s), np.sin(s)], 1), np.stack([1.2 * np.cos(s) + 0.1, 0.9 * np.sin(s)], 1)
 
 
-def library_weight(n: int):
+def library_weight(n: int, guide: str = "RecedingGuide"):
     """The weight as a user writes it."""
     import numpyro_bridges as nb
 
     x0, v = shapes(n)
-    space, match = nb.Landmarks(n, 2), nb.InexactMatch(VARIANCE)
+    space, match, leading = nb.Landmarks(n, 2), nb.InexactMatch(VARIANCE), getattr(nb, guide)()
 
     def log_weight(parameters, noise):
         flow = nb.KunitaFlow(space, nb.GaussianKernel(*parameters))
-        bridge = nb.GuidedBridge(flow, match.at(v), x0=x0, t1=1.0, num_steps=NUM_STEPS)
+        bridge = nb.GuidedBridge(flow, match.at(v), x0=x0, t1=1.0, num_steps=NUM_STEPS, guide=leading)
         return bridge.log_weight(noise)
 
     return log_weight
@@ -110,8 +110,10 @@ def measure(n: int, num_paths: int, repeats: int) -> dict:
     results = {}
     for kind in ("value", "gradient"):
         pair = {}
-        for name, make in (("library", library_weight), ("plain", plain_weight)):
-            program, seconds, flops = compiled(programs(make(n))[kind], parameters, noise)
+        weights = {"library": library_weight(n), "plain": plain_weight(n)}
+        weights["geodesic"] = library_weight(n, "GeodesicGuide")
+        for name, weight in weights.items():
+            program, seconds, flops = compiled(programs(weight)[kind], parameters, noise)
             pair[name] = program
             row[f"{kind}_{name}_compile_s"] = round(seconds, 2)
             row[f"{kind}_{name}_gflop"] = round(flops / 1e9, 3)
@@ -125,6 +127,7 @@ def measure(n: int, num_paths: int, repeats: int) -> dict:
         for name in pair:
             row[f"{kind}_{name}_s"] = round(min(times[name]), 4)
         row[f"{kind}_ratio"] = round(float(np.median(np.divide(times["library"], times["plain"]))), 3)
+        row[f"{kind}_geodesic_ratio"] = round(float(np.median(np.divide(times["geodesic"], times["library"]))), 3)
     row["gradient_over_value"] = round(row["gradient_library_s"] / row["value_library_s"], 2)
     row["value_difference"] = float(abs(results["value", "library"] / results["value", "plain"] - 1))
     row["jax"], row["device"] = jax.__version__, jax.devices()[0].device_kind
