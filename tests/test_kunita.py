@@ -142,13 +142,14 @@ def simulated_targets(shared_data):
     space = nb.Landmarks(16, 2, weights=1.0)
     flow = nb.KunitaFlow(space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5))
     setting = flow, nb.InexactMatch(1e-3), data["root"], data["edge_targets"], 100
-    return log_weights(*setting, nb.RecedingGuide(), 2500), log_weights(*setting, nb.FrozenGuide(), 300)
+    counts = (nb.RecedingGuide(), 2500), (nb.FrozenGuide(), 300), (nb.GeodesicGuide(), 1000)
+    return [log_weights(*setting, guide, count) for guide, count in counts]
 
 
 @pytest.mark.parametrize("target", REFERENCE)
 def test_simulated_targets(simulated_targets, target):
-    """Evidence as in the table, whose runs have an effective size of 80 to 160, as these; spread of both guides."""
-    receding, frozen = (x[target] for x in simulated_targets)
+    """Evidence as in the table, whose runs have an effective size of 80 to 160, as these; spread of the guides."""
+    receding, frozen, geodesic = (x[target] for x in simulated_targets)
     value, own = REFERENCE[target]
     found = float(nb.weights.log_mean_exp(receding))
     weight = np.exp(receding - found)
@@ -159,6 +160,29 @@ def test_simulated_targets(simulated_targets, target):
     assert abs(found - value) < 3 * np.hypot(error, own)
     assert receding.std() < 3
     assert frozen.std() > 3 * receding.std()
+    assert geodesic.std() < 1.2
+    assert abs(float(nb.weights.log_mean_exp(geodesic)) - found) < 0.5
+
+
+def test_a_simulated_tree(shared_data):
+    """Nine tips, 12 branches of 100 steps. Decided before the run: Ψ of mean at least 72 and of SD at most 8."""
+    data = np.load(shared_data / "kunita_cases" / "kunita_cases.npz")
+    space, steps = nb.Landmarks(16, 2, weights=1.0), 100
+    flow = nb.KunitaFlow(space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5))
+    tree = nb.Tree.from_newick("((a:1,b:1,c:1):1,(d:1,e:1,f:1):1,(g:1,h:1,i:1):1);")
+    law = nb.DiffusionTree(flow, data["root"], nb.InexactMatch(1e-3), tree=tree, num_steps=steps)
+
+    def weighed(z):
+        bound = law.given(z)
+        return bound.log_prob(data["tree_leaves"]), bound.path(data["tree_leaves"])[:, -1]
+
+    z = jr.normal(jr.key(1), (100, *law.noise_prior().shape()))
+    found, nodes = jax.jit(lambda z: jax.lax.map(weighed, z, batch_size=20))(z)
+    tips = [node - 1 for node in tree.tips]  # branch i leads to node i + 1
+    off = float(np.sqrt(np.mean((nodes[:, np.array(tips)] - data["tree_leaves"][None]) ** 2)))
+    print(f"mean {found.mean():.1f}, SD {found.std():.2f}, tips {off:.4f} from what is seen, whose SD is 0.0316")
+    assert found.mean() > 72 and found.std() < 8
+    assert off < 1.2 * np.sqrt(1e-3)
 
 
 def test_real_wings():
