@@ -88,7 +88,7 @@ def butterflies():
             return
         outline = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(3, 4))
         shapes.append(outline[np.round(np.arange(64) * len(outline) / 64).astype(int)])
-    x0, v = nb.procrustes_align(np.stack(shapes), closed=True)[0]
+    x0, v = nb.shapes.procrustes_align(np.stack(shapes)).shapes
     space = nb.Landmarks(64, 2)
     match = nb.InexactMatch(0.02**2 / 32)
     setting = {"x0": x0, "t1": 1.0, "num_steps": 40}

@@ -80,7 +80,8 @@ class GuidedBridge(eqx.Module):
     - `num_steps`, or `ts`: the number of steps of the default grid, or an increasing grid `(K + 1,)` from t0 to t1. The
       default is uniform, and graded towards t1, t = s(2 − s/T), where the end state is pinned. A grid whose steps
       vanish in the precision used is refused.
-    - `guide`: by default `GeodesicGuide()` where a depends on the state and `FrozenGuide()` where it is constant.
+    - `guide`: by default `FrozenGuide()` where a is constant, `GeodesicGuide()` for a Kunita flow, `RecedingGuide()`
+      where a depends on the state otherwise.
     - `solver`: by default the guided step with its exact discrete weight. An Itô diffrax solver steps the guided drift
       instead, with the continuous-time weight: consistent as dt → 0, biased at fixed dt, and no target for MCMC. A
       Stratonovich solver is refused unless both readings of the SDE coincide.

@@ -298,9 +298,11 @@ def test_default_guide_and_grid():
     assert isinstance(bridge.guide, nb.FrozenGuide) and bridge.num_steps == 4
     np.testing.assert_allclose(bridge.ts, [0.5, 1.0, 1.5, 2.0, 2.5])
     bridge = nb.GuidedBridge(curved, nb.ExactMatch().at(V), x0=X3, t0=0.5, t1=2.5, num_steps=np.int64(4))
-    assert isinstance(bridge.guide, nb.GeodesicGuide) and bridge.noise_shape == (4, 3, 1)
+    assert isinstance(bridge.guide, nb.RecedingGuide) and bridge.noise_shape == (4, 3, 1)
     s = np.linspace(0, 1, 5)
     np.testing.assert_allclose(bridge.ts, 0.5 + 2 * s * (2 - s))
+    flow, _, x0 = SDES["kunita-landmark"]()
+    assert isinstance(nb.GuidedBridge(flow, nb.InexactMatch(0.1).at(x0), x0=x0, ts=TS).guide, nb.GeodesicGuide)
     other = bridge.with_guide(nb.FrozenGuide())
     assert isinstance(other.guide, nb.FrozenGuide) and np.array_equal(other.ts, bridge.ts)
 

@@ -265,7 +265,7 @@ def test_the_covariance_must_match_at_an_exact_end():
 def test_guides_without_one_auxiliary_process():
     with pytest.raises(ValueError, match="RecedingGuide has none. Use `guide=FrozenGuide"):
         bridge(nb.InexactMatch(0.1), nb.RecedingGuide())
-    with pytest.raises(ValueError, match="GeodesicGuide has none"):
+    with pytest.raises(ValueError, match="RecedingGuide has none"):
         bridge(nb.InexactMatch(0.1), None)
 
 

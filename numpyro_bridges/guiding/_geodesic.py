@@ -120,5 +120,11 @@ class _GeodesicPlan(AbstractPlan):
 
 
 def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:
-    """`GeodesicGuide()` where a depends on the state, `FrozenGuide()` where it is constant."""
-    return FrozenGuide() if sde.has_constant_covariance(x) else GeodesicGuide()
+    """`FrozenGuide()` where a is constant, `GeodesicGuide()` for a flow, `RecedingGuide()` elsewhere.
+
+    With a drift, geodesics are no better than the linearised drift; with a strong one they are worse.
+    """
+    if sde.has_constant_covariance(x):
+        return FrozenGuide()
+    operator = jax.eval_shape(lambda: sde.linearised_drift(jnp.zeros((), x.dtype), x)[0])
+    return GeodesicGuide() if operator.ndim == 0 else RecedingGuide()
