@@ -8,7 +8,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -21,13 +20,11 @@ from .guiding import (
     AbstractPlan,
     GuidedStep,
     GuidedTerm,
-    arrive,
     default_guide,
     exact_message,
     levy_area,
-    retrace,
-    retrace_arrival,
-    travel,
+    reach,
+    retrace_reach,
     travel_continuous,
 )
 from .sdes import AbstractSDE, Frame, TimeGrid, still_frame, time_grid
@@ -384,9 +381,7 @@ class GuidedBridge(eqx.Module):
             auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
             path, log_weight = travel_continuous(frame.sde, auxiliary, self.solver, seen, ts, frame.start, noise, v)
         else:
-            path, y, log_weight = travel(frame.sde, plan, ts[:-1], frame.start, noise[:-1], v)
-            end, log_density = arrive(frame.sde, seen, ts, y, noise[-1], v)
-            path, log_weight = jnp.concatenate([path, end[None]]), log_weight + log_density
+            path, log_weight = reach(frame.sde, plan, seen, ts, frame.start, noise, v)
         path = frame.origins[1:] + path
         if self.condition.exact:  # to the last digit
             path = path.at[-1].set(self.condition.reference(self.sde, path[-1]))
@@ -463,10 +458,7 @@ class GuidedBridge(eqx.Module):
         assert plan is not None
         y = (path - frame.origins).at[0].set(frame.start)
         observed = apply(seen.operator, y[-1]) if seen.exact else self._target(problem, plan, jnp.zeros((0,))).value
-        key_path, key_end = (None, None) if key is None else jr.split(key)
-        z = retrace(frame.sde, plan, ts[:-1], y[:-1], observed, key_path)
-        last = retrace_arrival(frame.sde, seen, ts, y[-2], y[-1], observed, key_end)
-        z = jnp.concatenate([z, last[None]])
+        z = retrace_reach(frame.sde, plan, seen, ts, y, observed, key)
         if condition.num_extra_noises:
             message = self._start(problem, plan)
             mean = apply(message.operator, frame.start) + message.shift

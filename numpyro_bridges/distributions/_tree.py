@@ -22,7 +22,7 @@ from .._types import RealScalar, State
 from ..conditioning import AbstractMatch, fused
 from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE, as_covariance
-from ..trees import Root, Tree, TreeProblem, schedule
+from ..trees import Root, Tree, TreeProblem
 from ._batch import as_shape, find_batched, one_of
 from ._driving_noise import NoiseBlocks
 from ._endpoint import check_law, close_parts, names_of, seen_shape
@@ -126,7 +126,7 @@ class DiffusionTree(AbstractNoiseDriven):
         datum = jnp.zeros((len(tree.observed), *seen_shape(one)))
         _check_condition(one, datum)
         close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1), own_edges)
-        branches = len(schedule(tree.parents, tree.observed).active)
+        branches = len(tree.active)
         columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
         k = one["sde"].noise_size(one["x0"])
         noise_shape = (_root(one).num_rows(k) + branches * settings.num_steps, k, columns)
@@ -143,7 +143,7 @@ class DiffusionTree(AbstractNoiseDriven):
     def noise_blocks(self) -> NoiseBlocks:
         """The root, where it has a prior, and the branches that have noise, in preorder."""
         tree, num_steps = self.tree, self.parts["settings"].num_steps
-        branches = schedule(tree.parents, tree.observed).active
+        branches = tree.active
         root = self._noise_shape[0] - num_steps * len(branches)
         nodes = (0, *branches) if root else branches
         number = {node: i for i, node in enumerate(nodes)}
@@ -315,14 +315,15 @@ def _by_node(parts, value, noise):
 
 
 def _times(parts):
-    blank = jnp.zeros((len(parts["tree"].observed), *seen_shape(_simplest(parts))), parts["x0"].dtype)
-    depths = parts["t0"] + parts["tree"].depths
-    return depths[np.array(parts["tree"].parents)[_active(parts)]][:, None] + _unled(parts, blank).grids
+    tree = parts["tree"]
+    starts = parts["t0"] + tree.depths[np.array(tree.parents)[list(tree.active)]]
+    return starts[:, None] + _without_data(parts).grids
 
 
-def _active(parts):
-    """Nodes whose branches have noise."""
-    return np.array(schedule(parts["tree"].parents, parts["tree"].observed).active)
+def _without_data(parts) -> TreeProblem:
+    """The problem of data that are all 0: for what does not depend on them."""
+    shape = len(parts["tree"].observed), *seen_shape(_simplest(parts))
+    return _unled(parts, jnp.zeros(shape, parts["x0"].dtype))
 
 
 def _paths(parts, value, noise):
@@ -338,8 +339,7 @@ def _simulated(parts, key):
     """What is seen, and the paths of the branches that lead to it."""
     key_path, key_seen = jr.split(key)
     tree, match, own = parts["tree"], parts["match"], parts["settings"].per_row
-    blank = jnp.zeros((len(tree.observed), *seen_shape(_simplest(parts))), parts["x0"].dtype)
-    problem = _unled(parts, blank)
+    problem = _without_data(parts)
     sde, x0 = problem.sde, problem.x0
     shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])
     paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))

@@ -7,8 +7,9 @@ from ._continuous import (
 )
 from ._edge import (
     arrive as arrive,
+    reach as reach,
     retrace as retrace,
-    retrace_arrival as retrace_arrival,
+    retrace_reach as retrace_reach,
     travel as travel,
 )
 from ._geodesic import GeodesicGuide as GeodesicGuide, default_guide as default_guide

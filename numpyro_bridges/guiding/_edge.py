@@ -1,8 +1,7 @@
 """One edge: a path from a state to what is seen of its end, its log weight, and the way back from a path to its noise.
 
-`travel` takes steps led by a plan: all to an inner node of a tree, all but the last to what is seen;
-`arrive` takes that one, onto the observation itself, exactly whatever guides. `retrace` and `retrace_arrival` recover
-the noise.
+`travel` takes steps led by a plan, as to an inner node of a tree; `arrive` takes the last step to what is seen, onto
+the observation itself, exactly whatever guides; `reach` does both. `retrace` and `retrace_reach` recover the noise.
 """
 
 import functools
@@ -63,6 +62,21 @@ def arrive(
     return x, steering.log_evidence() + seen.log_scale
 
 
+def reach(
+    sde: AbstractSDE,
+    plan: AbstractPlan,
+    seen: Observation,
+    ts: Float[Array, " K+1"],
+    x0: State,
+    noise: Float[Array, "K k *dim"],
+    observed: State,
+) -> tuple[Float[Array, "K n *dim"], Float[Array, ""]]:
+    """The states after x0, to an end that is seen, and the log weight. The plan has an entry for each time but it."""
+    path, x, log_weight = travel(sde, plan, ts[:-1], x0, noise[:-1], observed)
+    end, log_density = arrive(sde, seen, ts, x, noise[-1], observed)
+    return jnp.concatenate([path, end[None]]), log_weight + log_density
+
+
 def retrace(
     sde: AbstractSDE,
     plan: AbstractPlan,
@@ -82,20 +96,25 @@ def retrace(
     return jax.vmap(step)(path[:-1], path[1:], ts[:-1], ts[1:], _ends(plan), free)
 
 
-def retrace_arrival(
+def retrace_reach(
     sde: AbstractSDE,
+    plan: AbstractPlan,
     seen: Observation,
     ts: Float[Array, " K+1"],
-    x: State,
-    end: State,
+    path: Float[Array, "K+1 n *dim"],
     observed: State,
     key: PRNGKeyArray | None,
-) -> Noise:
-    """The noise by which `arrive` takes the last step, from x to the end."""
-    free, without_effect = _free_noise(sde, jnp.stack([x, x]), key)
+) -> Float[Array, "K k *dim"]:
+    """The noise by which `reach` takes a path."""
+    key_path, key_end = (None, None) if key is None else jr.split(key)
+    z = retrace(sde, plan, ts[:-1], path[:-1], observed, key_path)
+    x, end = path[-2:]
+    free, without_effect = _free_noise(sde, path[-2:], key_end)
     transition, steering = _last_step(sde, seen, ts, x, observed)
-    z = steering.inverse(_driving_noise(transition, end, free))
-    return z + steering.without_effect(without_effect) if seen.exact else z
+    last = steering.inverse(_driving_noise(transition, end, free))
+    if seen.exact:
+        last = last + steering.without_effect(without_effect)
+    return jnp.concatenate([z, last[None]])
 
 
 def _free_noise(sde, states, key):

@@ -19,7 +19,6 @@ from numpyro.ops.provenance import eval_provenance
 
 from .._checks import flag, positive_integer, require, require_instance, require_mapping
 from ..distributions import AbstractNoiseDriven, DiffusionEndpoint, DiffusionTree
-from ..trees import schedule
 from ._posterior import is_latent, is_noise, sites_of
 from ._statistics import statistics
 
@@ -164,7 +163,7 @@ def to_arviz(
         )
         found = _mapped(lambda draw: bridges(lost(driving) | draw, driven), driving, places)
         leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven}
-        ends = {name: _labels(tree, _active(tree)) for name, tree in trees.items()}
+        ends = {name: _labels(tree, tree.active) for name, tree in trees.items()}
         datasets["posterior_paths"] = _labelled(found, leading, kept, coords, ends)
     groups = {
         "posterior": visible(samples),
@@ -269,17 +268,12 @@ def _without(value, mask):
 
 def _states(law, observed):
     """Of the root and of all nodes that lead to something seen, `(nodes, n, dim)` behind a batch."""
-    nodes = np.array((0, *_active(law.tree)))
+    nodes = np.array((0, *law.tree.active))
     return jnp.take(law.nodes(observed), nodes, axis=law.noise.ndim - 3)
 
 
 def _labels(tree, nodes) -> list[str]:
     return [tree.names[node] or f"node {node}" for node in nodes]
-
-
-def _active(tree) -> tuple[int, ...]:
-    """Nodes but the root that lead to something seen, in preorder."""
-    return schedule(tree.parents, tree.observed).active
 
 
 def _axis(name, axis, labels) -> str:
@@ -295,7 +289,7 @@ def _of_nodes(found, leading, draws, coords, trees):
         before = tuple(range(number))
         spread = np.fmax.reduce(every, axis=before) - np.fmin.reduce(every, axis=before)  # NaN where masked
         varies = np.fmax.reduce(spread.reshape(len(spread), -1), axis=1) > 1e-6 * np.nanmax(np.abs(every))
-        own = _labels(trees[name], [0, *_active(trees[name])])
+        own = _labels(trees[name], [0, *trees[name].active])
         labels[name] = [label for label, kept in zip(own, varies, strict=True) if kept]
         values[name] = np.compress(varies, every, axis=number)
         inner[name] = dict(zip(("coordinate", "point"), values[name].shape[: number : -1], strict=False))

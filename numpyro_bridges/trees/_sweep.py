@@ -29,46 +29,16 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._linalg import apply, cholesky, full_precision, solve_lower, varying_like
+from .._linalg import apply, full_precision, varying_like
 from .._types import State
 from ..conditioning import AbstractCondition, GaussianMessage, Observation, lift
-from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, arrive, default_guide, retrace, retrace_arrival, travel
+from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, default_guide, reach, retrace, retrace_reach, travel
 from ..sdes import AbstractSDE, AffineStep, BrownianMotion, Displaced
+from ._information import Information
 from ._root import Root
 from ._schedule import Schedule, schedule
-from ._told import Told, as_seen, earlier, nothing_told, told_by
+from ._told import as_seen, earlier, told_by
 from ._tree import Tree
-
-_LOG_2PI = 1.8378770664093453
-_NUGGET = 1e-12
-"""Added to the diagonal of a message, relative to its largest entry: what is not seen at all has no information."""
-
-
-class Information(NamedTuple):
-    """log h(y) = c + Fᵀy − ½ yᵀHy of a displacement y from the anchor; columns share H."""
-
-    H: Float[Array, "n n"]
-    F: State
-    c: Float[Array, ""]
-
-    def __add__(self, other):  # type: ignore[override]
-        return Information(*(a + b for a, b in zip(self, other, strict=True)))
-
-    def as_observation(self) -> tuple[Observation, State, Float[Array, ""]]:
-        """The same as an observation w = Rᵀ y + N(0, I), and the log density that it has too much."""
-        n, dtype = self.H.shape[0], self.H.dtype
-        nugget = _NUGGET if dtype == jnp.float64 else 1e-6
-        diagonal = jnp.diagonal(self.H)
-        R = cholesky(self.H + nugget * jnp.max(diagonal) * jnp.eye(n, dtype=dtype))
-        w = solve_lower(R, self.F)
-        excess = -0.5 * jnp.sum(w * w) - 0.5 * self.F.size * _LOG_2PI
-        return Observation(R.T, jnp.ones((), dtype), jnp.zeros((), dtype)), w, self.c - excess
-
-
-def nothing(like: State) -> Information:
-    """The message of no data."""
-    n = like.shape[0]
-    return Information(jnp.zeros((n, n), like.dtype), jnp.zeros_like(like), jnp.zeros((), like.dtype))
 
 
 class Branch(NamedTuple):
@@ -92,7 +62,7 @@ class UpwardPass(NamedTuple):
     """Of the branches to inner nodes, in the order of the schedule."""
     data: State
     ends: "Led"
-    at_root: Information | Told
+    at_root: Information
 
 
 class Led(NamedTuple):
@@ -253,12 +223,9 @@ class TreeProblem(eqx.Module):
 
         def end(led, branch, path, key):
             plan, seen, observed, ts = led
-            edge, y = self._edge(branch), path - branch.anchor
+            y = path - branch.anchor
             observed = apply(seen.operator, y[-1]) if seen.exact else observed
-            key_path, key_end = jr.split(key)
-            z = retrace(edge, plan, ts[:-1], y[:-1], observed, key_path)
-            last = retrace_arrival(edge, seen, ts, y[-2], y[-1], observed, key_end)
-            return jnp.concatenate([z, last[None]])
+            return retrace_reach(self._edge(branch), plan, seen, ts, y, observed, key)
 
         key_root, key = jr.split(key)
         keys = jr.split(key, len(walk.active))
@@ -324,25 +291,25 @@ class TreeProblem(eqx.Module):
     def _sde_of(self, own: AbstractSDE | None) -> AbstractSDE:
         return self.sde if own is None else eqx.combine(own, self.sde)
 
-    def _inner_plan(self, branch: Branch, seen: Observation, reference: State, *beyond) -> AbstractPlan:
-        """With an entry at the end too: the last step to an inner node is led like the others."""
+    def _inner_grid(self, branch: Branch) -> Array:
+        """Times with an entry of a plan at the end too: the last step to an inner node is led like the others."""
         ts = self._grid(branch.length, False)
-        ts, edge = jnp.concatenate([ts, ts[-1:]]), self._edge(branch)
+        return jnp.concatenate([ts, ts[-1:]])
+
+    def _inner_plan(self, branch: Branch, seen: Observation, reference: State, *beyond) -> AbstractPlan:
+        edge, ts = self._edge(branch), self._inner_grid(branch)
         if isinstance(self.guide, FrozenGuide):
             return self.guide.plan(edge, seen, reference, ts, branch.steps)
         return self.guide.plan(edge, seen, reference, ts, *beyond)
 
-    def _with_steps(self) -> "TreeProblem":
-        """With all that can be known of branches before any message, in one program for all of them."""
+    def _with_steps(self, branches: Branch) -> Branch:
+        """Inner branches with all that can be known before any message, in one program for all of them."""
         guide = self.guide
         if not isinstance(guide, FrozenGuide):
-            return self
-
-        def of(branch):
-            ts = self._grid(branch.length, False)
-            return guide.steps(self._edge(branch), jnp.zeros_like(self.x0), jnp.concatenate([ts, ts[-1:]]))
-
-        return replace(self, branches=self.branches._replace(steps=jax.vmap(of)(self.branches)))
+            return branches
+        here = jnp.zeros_like(self.x0)
+        steps = jax.vmap(lambda branch: guide.steps(self._edge(branch), here, self._inner_grid(branch)))(branches)
+        return branches._replace(steps=steps)
 
     def _start_message(self, plan, branch: Branch, observed: State) -> Information:
         """What the branch tells its parent, as a displacement from the parent's anchor."""
@@ -352,7 +319,7 @@ class TreeProblem(eqx.Module):
         message = plan.message(entry, self._edge(branch), zero, between, observed)
         shift = message.shift + apply(message.operator, between)
         message = GaussianMessage(message.operator, shift, message.factor, observed, message.log_scale)
-        return _information(message, self.x0)
+        return Information.of(message, self.x0)
 
     def _seen(self, condition: AbstractCondition, anchor: State) -> tuple[Observation, State]:
         """What is seen of a node, a displacement from its anchor."""
@@ -384,8 +351,7 @@ class TreeProblem(eqx.Module):
         def of_node(condition, anchor):
             seen, observed = self._seen(condition, anchor)
             factor = seen.factor if seen.factor is not None else jnp.zeros((), self.x0.dtype)
-            message = GaussianMessage(seen.operator, jnp.zeros_like(observed), factor, observed, seen.log_scale)
-            return _information(message, self.x0)
+            return Information.told_by(seen, observed, factor, self.x0)
 
         def joined(total, branch):
             seen, w, c = total.as_observation()
@@ -393,20 +359,21 @@ class TreeProblem(eqx.Module):
             message = self._start_message(plan, branch, w)
             return message._replace(c=message.c + c), (plan, w)
 
-        own = self._own_messages(nothing(self.x0), jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
-        at_root, (plans, data) = self._with_steps()._summed_up(own, joined)
+        own = self._own_messages(jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
+        at_root, (plans, data) = self._summed_up(own, joined, self._with_steps(self._of(self.schedule.inner)))
         return UpwardPass(plans, data, ends, at_root)
 
     def _up_with_means(self, ends: Led) -> UpwardPass:
         """Each branch by the mean of what is seen below, of whatever covariance the process has there."""
         first = jax.tree.map(lambda a: a[0], self.branches)
-        a, n = self._edge(first).covariance(jnp.zeros((), self.x0.dtype), jnp.zeros_like(self.x0)), self.x0.shape[0]
+        zero = jnp.zeros((), self.x0.dtype)
+        a = self._edge(first).covariance(zero, jnp.zeros_like(self.x0))
 
         def of_end(led, branch):
-            return told_by(led.seen, led.observed, branch.length, a, n)
+            return told_by(led.seen, led.observed, branch.length, a, self.x0)
 
         def of_node(condition, anchor):
-            return told_by(*self._seen(condition, anchor), jnp.zeros((), self.x0.dtype), a, n)
+            return told_by(*self._seen(condition, anchor), zero, a, self.x0)
 
         def joined(total, branch):
             return earlier(total, branch.length, a), total
@@ -416,27 +383,27 @@ class TreeProblem(eqx.Module):
             return self._inner_plan(branch, seen, reference, beyond), value
 
         everything = ends.seen.operator.ndim == 1  # for each end the identity
-        messages = jax.vmap(of_end)(ends, self._of(self.schedule.ends))
-        at_root, totals = self._summed_up(self._own_messages(nothing_told(self.x0), messages, of_node), joined)
-        plans, data = jax.vmap(led)(totals, self._of(self.schedule.inner))
-        return UpwardPass(plans, data, ends, at_root)
+        inner = self._of(self.schedule.inner)
+        own = self._own_messages(jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
+        at_root, totals = self._summed_up(own, joined, inner)
+        plans, data = jax.vmap(led)(totals, inner)
+        return UpwardPass(plans, data, ends, at_root.information)
 
-    def _own_messages(self, nothing, messages, of_node):
+    def _own_messages(self, messages, of_node):
         """For each node of the tree what is told by what is seen of it and by the ends that hang on it."""
         schedule, count = self.schedule, len(self.parents)
         above = np.array(self.parents)[list(schedule.ends)]
-        totals = jax.tree.map(lambda a: jnp.zeros((count, *a.shape), a.dtype), nothing)
-        totals = jax.tree.map(lambda a, b: a.at[above].add(b), totals, messages)
+        totals = jax.tree.map(lambda a: jnp.zeros((count, *a.shape[1:]), a.dtype).at[above].add(a), messages)
         inside = [node for node in (0, *schedule.inner) if node in self.observed]
         if inside:
             own = jax.vmap(of_node)(self._rows(inside), self._anchors(inside))
             totals = jax.tree.map(lambda a, b: a.at[np.array(inside)].add(b), totals, own)
         return totals
 
-    def _summed_up(self, own, joined):
+    def _summed_up(self, own, joined, branches: Branch):
         """The sum of what is told at the root, and what `joined` makes of it at inner nodes, as the schedule has them.
 
-        `joined(total, branch)` gives what the node's branch tells its parent, and what is kept of it.
+        `joined(total, branch)` gives what the node's branch, one of `branches`, tells its parent, and what is kept.
         """
         schedule = self.schedule
         kept = jax.tree.map(lambda a: jnp.zeros((schedule.num_slots + 1, *a.shape[1:]), a.dtype), own)
@@ -446,7 +413,7 @@ class TreeProblem(eqx.Module):
         def step(kept, inputs):
             own, branch, slot, parent_slot, first = inputs
             below = jax.tree.map(lambda a: jnp.where(slot < schedule.num_slots, a[slot], 0.0), kept)
-            message, out = joined(own + below, branch)
+            message, out = joined(jax.tree.map(jnp.add, own, below), branch)
             kept = jax.tree.map(
                 lambda a, b: a.at[parent_slot].set(jnp.where(first, 0.0, a[parent_slot]) + b), kept, message
             )
@@ -454,7 +421,7 @@ class TreeProblem(eqx.Module):
 
         inputs = (
             _picked(own, order),
-            self._of(order),
+            jax.tree.map(lambda a: jnp.flip(a, 0), branches),
             np.array(schedule.slot[::-1], int),
             np.array(schedule.parent_slot[::-1], int),
             np.array(schedule.first[::-1], bool),
@@ -501,11 +468,8 @@ class TreeProblem(eqx.Module):
 
         def end(led, branch, x, z):
             plan, seen, observed, ts = led
-            sde, y = self._edge(branch), x - branch.anchor
-            path, y, log_weight = travel(sde, plan, ts[:-1], y, z[:-1], observed)
-            last, log_density = arrive(sde, seen, ts, y, z[-1], observed)
-            path = branch.anchor[None] + jnp.concatenate([path, last[None]])
-            return jnp.concatenate([x[None], path]), log_weight + log_density
+            path, log_weight = reach(self._edge(branch), plan, seen, ts, x - branch.anchor, z, observed)
+            return jnp.concatenate([x[None], branch.anchor[None] + path]), log_weight
 
         end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
         paths = jnp.zeros((len(schedule.active), K + 1, *self.x0.shape), self.x0.dtype)
@@ -537,7 +501,3 @@ def _picked(tree, rows: Sequence[int]):
     """Some rows of every array; a scan or a map over none of them is none."""
     return jax.tree.map(lambda a: a[np.array(rows, int)], tree)
 
-
-def _information(message: GaussianMessage, like: State) -> Information:
-    H, F, c = message.information(like.shape[0])
-    return Information(H, F.reshape(like.shape), c)

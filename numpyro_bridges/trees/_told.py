@@ -23,7 +23,8 @@ from jaxtyping import Array, Float
 
 from .._linalg import add, cholesky, congruence, diagonal, promote, solve_lower
 from .._types import State, Structured
-from ..conditioning import GaussianMessage, Observation
+from ..conditioning import Observation
+from ._information import Information
 
 _KEPT = 0.01
 """The part of κ a that does not follow: rounding, of whatever precision, is less than it and so leaves a covariance."""
@@ -32,37 +33,31 @@ _KEPT = 0.01
 class Told(NamedTuple):
     """Sums over branches that meet, and over what is seen of a node."""
 
-    H: Float[Array, "n n"]
-    F: State
+    information: Information
+    """Of the state, where a is a₀."""
     rate: Float[Array, ""]
     """1/κ."""
 
-    def __add__(self, other):  # type: ignore[override]
-        return Told(*(a + b for a, b in zip(self, other, strict=True)))
 
-
-def nothing_told(like: State) -> Told:
-    """The sums over nothing."""
-    n = like.shape[0]
-    return Told(jnp.zeros((n, n), like.dtype), jnp.zeros_like(like), jnp.zeros((), like.dtype))
-
-
-def told_by(seen: Observation, observed: State, time: Array, a: Structured, n: int) -> Told:
-    """What an observation tells of the state, of n rows, a time before."""
+def told_by(seen: Observation, observed: State, time: Array, a: Structured, like: State) -> Told:
+    """What an observation tells of the state a time before, which is like this."""
     factor = cholesky(add(seen.covariance, time * congruence(seen.operator, a)))
-    H, F = _information(seen, factor, observed, n)
-    if seen.exact:
-        return Told(H, F, 1 / time)
-    error, _ = _information(seen, seen.factor, observed, n)
+    information = Information.told_by(seen, observed, factor, like)
+    if seen.factor is None:
+        return Told(information, 1 / time)
+    error = Information.told_by(seen, observed, seen.factor, like)
     # κ a for the κ of which this is the rate is no more than the error, for whatever direction
-    rate = jnp.trace(error) * jnp.sum(diagonal(a, n))
-    return Told(H, F, _after(rate, time))
+    rate = jnp.trace(error.H) * jnp.sum(diagonal(a, like.shape[0]))
+    return Told(information, _after(rate, time))
 
 
-def _information(seen, factor, observed, n):
-    message = GaussianMessage(seen.operator, jnp.zeros_like(observed), factor, observed, jnp.zeros((), factor.dtype))
-    H, F, _ = message.information(n)
-    return H, F.reshape((n, *observed.shape[1:]))
+def earlier(told: Told, time: Array, a: Structured) -> Told:
+    """What is told of a node tells of the state a time before."""
+    seen, w, c = told.information.as_observation()
+    one = jnp.eye(len(w), dtype=w.dtype)
+    factor = cholesky(one + time * promote(congruence(seen.operator, a), 2, len(w)))
+    information = Information.told_by(seen, w, factor, told.information.F)
+    return Told(information._replace(c=information.c + c), _after(told.rate, time))
 
 
 def _after(rate, time):
@@ -83,35 +78,16 @@ class Seen(NamedTuple):
 
 def as_seen(told: Told, a: Structured, everything: bool) -> Seen:
     """`everything`: whether all of every state is seen."""
-    n, dtype = told.F.shape[0], told.F.dtype
-    eye = jnp.eye(n, dtype=dtype)
-    R = cholesky(told.H + _nugget(told.H))
-    value = solve_lower(R, told.F)
+    seen, value, _ = told.information.as_observation()
+    operator, R, n, dtype = seen.operator, seen.operator.T, len(value), value.dtype
+    whole = jnp.eye(n, dtype=dtype)
     mean = solve_lower(R, value, transposed=True)
-    kappa = jnp.where(told.rate > 0, 1 / jnp.where(told.rate > 0, told.rate, 1.0), 0.0)
     if everything:
-        inverse = solve_lower(R, eye)
+        inverse = solve_lower(R, whole)
         operator, value, whole = jnp.ones((), dtype), mean, inverse.T @ inverse
-    else:
-        operator, whole = R.T, eye
+    kappa = jnp.where(told.rate > 0, 1 / jnp.where(told.rate > 0, told.rate, 1.0), 0.0)
     kappa = (1 - _KEPT) * kappa
     error = whole - kappa * promote(congruence(operator, a), 2, n)
     found = jnp.all(jnp.isfinite(cholesky(lax.stop_gradient(error))))  # and where it does not, nothing follows
     factor = cholesky(jnp.where(found, error, whole))
     return Seen(Observation(operator, factor, jnp.zeros((), dtype)), value, jnp.where(found, kappa, 0.0), mean)
-
-
-def earlier(told: Told, time: Array, a: Structured) -> Told:
-    """What is told of a node tells of the state a time before."""
-    n = told.F.shape[0]
-    R = cholesky(told.H + _nugget(told.H))
-    one = jnp.ones((), told.F.dtype)
-    factor = cholesky(jnp.eye(n, dtype=told.F.dtype) + time * promote(congruence(R.T, a), 2, n))
-    H, F = _information(Observation(R.T, one, 0 * one), factor, solve_lower(R, told.F), n)
-    return Told(H, F, _after(told.rate, time))
-
-
-def _nugget(H):
-    """What is not seen at all has no information; to rounding."""
-    relative = 1e-12 if H.dtype == jnp.float64 else 1e-6
-    return relative * jnp.max(jnp.diagonal(H)) * jnp.eye(H.shape[0], dtype=H.dtype)

@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import as_float, concrete, flag, known_float, require, require_instance, words
 from ._newick import parse
+from ._schedule import schedule
 
 
 @runtime_checkable
@@ -179,6 +180,11 @@ class Tree(eqx.Module):
         """Numbers of the nodes without children."""
         inner = set(self.parents)
         return tuple(i for i in range(len(self.parents)) if i not in inner)
+
+    @property
+    def active(self) -> tuple[int, ...]:
+        """Numbers of the nodes but the root that lead to something seen: those whose branches have noise."""
+        return schedule(self.parents, self.observed).active
 
     @property
     def observed_names(self) -> tuple[str | None, ...]:

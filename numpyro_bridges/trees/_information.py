@@ -1,0 +1,46 @@
+"""A Gaussian message of any rank as numbers that are added where branches meet."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._linalg import cholesky, solve_lower
+from .._types import State, Structured
+from ..conditioning import GaussianMessage, Observation
+
+_LOG_2PI = 1.8378770664093453
+
+
+class Information(NamedTuple):
+    """log h(y) = c + Fᵀy − ½ yᵀHy of a displacement y from the anchor; columns share H."""
+
+    H: Float[Array, "n n"]
+    F: State
+    c: Float[Array, ""]
+
+    @classmethod
+    def of(cls, message: GaussianMessage, like: State) -> "Information":
+        """Of a message about states like this."""
+        H, F, c = message.information(like.shape[0])
+        return cls(H, F.reshape(like.shape), c)
+
+    @classmethod
+    def told_by(cls, seen: Observation, observed: State, factor: Structured, like: State) -> "Information":
+        """Of an observation whose error has this factor."""
+        message = GaussianMessage(seen.operator, jnp.zeros_like(observed), factor, observed, seen.log_scale)
+        return cls.of(message, like)
+
+    def as_observation(self) -> tuple[Observation, State, Float[Array, ""]]:
+        """The same as an observation w = Rᵀ y + N(0, I), R Rᵀ = H, and the log density that it has too much."""
+        R = cholesky(self.H + nugget(self.H))
+        w = solve_lower(R, self.F)
+        one = jnp.ones((), R.dtype)
+        excess = -0.5 * jnp.sum(w * w) - 0.5 * self.F.size * _LOG_2PI
+        return Observation(R.T, one, 0 * one), w, self.c - excess
+
+
+def nugget(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Added to a matrix of which some directions may have nothing, relative to its largest entry."""
+    relative = 1e-12 if S.dtype == jnp.float64 else 1e-6
+    return relative * jnp.max(jnp.diagonal(S)) * jnp.eye(S.shape[0], dtype=S.dtype)
