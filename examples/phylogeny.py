@@ -33,7 +33,6 @@ import matplotlib
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-import xarray as xr
 from numpyro.infer import MCMC, Predictive
 
 import numpyro_bridges as nb
@@ -193,24 +192,16 @@ def infer(data, arguments, sd):
     print(f"{arguments.samples} draws; divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
     prior = Predictive(parameters, num_samples=2000)(jr.key(1), data.several, sd)
     results = nb.to_arviz(mcmc, prior=prior)
-    results["posterior"]["ancestor"] = ancestors(data, arguments, sd, samples)
+    results["posterior"]["ancestor"] = ancestors(data, arguments, results)
     return {name: samples[name] for name in prior}, prior, results
 
 
-def ancestors(data, arguments, sd, samples):
-    """The inner nodes: a draw of the parameters and the noise is a draw of the paths, nothing is to be simulated."""
-    rows, inner = np.nan_to_num(data.rows), inner_nodes(data.tree, arguments)
-
-    def states(draw):
-        law = law_of(data, arguments, draw["amplitude"], draw["length_scale"], draw.get("within", sd))
-        return law.given(draw["specimens_noise"]).nodes(rows)[np.array(inner)]
-
-    shape = samples["specimens_noise"].shape[:2]
-    draws = {name: np.concatenate(values) for name, values in samples.items()}
-    found = jax.jit(lambda draws: jax.lax.map(states, draws))(draws)
-    dims = ("chain", "draw", "node", "point", "coordinate")
-    coords = {"node": [name_of(data.tree, node) for node in inner], "coordinate": list("xyz"[: data.start.shape[1]])}
-    return xr.DataArray(np.reshape(found, (*shape, *found.shape[1:])), dims=dims, coords=coords)
+def ancestors(data, arguments, results):
+    """The inner nodes among all, with names: a draw of parameters and noise is a draw of the paths."""
+    tree, inner = data.tree, inner_nodes(data.tree, arguments)
+    nodes = results["posterior_nodes"]["specimens"].sel(node=[tree.names[node] or f"node {node}" for node in inner])
+    labels = {"node": [name_of(tree, node) for node in inner], "coordinate": list("xyz"[: data.start.shape[1]])}
+    return nodes.assign_coords(labels)
 
 
 def inner_nodes(tree, arguments):
