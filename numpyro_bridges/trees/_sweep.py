@@ -29,7 +29,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._linalg import apply, full_precision, varying_like
+from .._linalg import apply, full_precision, promote, varying_like
 from .._types import State
 from ..conditioning import AbstractCondition, GaussianMessage, Observation, lift
 from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, default_guide, reach, retrace, retrace_reach, travel
@@ -308,7 +308,15 @@ class TreeProblem(eqx.Module):
         if not isinstance(guide, FrozenGuide):
             return branches
         here = jnp.zeros_like(self.x0)
-        steps = jax.vmap(lambda branch: guide.steps(self._edge(branch), here, self._inner_grid(branch)))(branches)
+
+        def of(branch):
+            steps = guide.steps(self._edge(branch), here, self._grid(branch.length, False))
+            one, n = jnp.ones((), here.dtype), len(here)
+            operator = promote(one, steps.operator.ndim - 1, n)
+            still = AffineStep(operator, here, promote(0 * one, steps.covariance.ndim - 1, n))  # the end is in no time
+            return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), steps, still)
+
+        steps = jax.vmap(of)(branches)
         return branches._replace(steps=steps)
 
     def _start_message(self, plan, branch: Branch, observed: State) -> Information:
