@@ -107,13 +107,13 @@ READERS += [reads_an_instance, reads_through_partial, reads_an_array]
 @pytest.fixture
 def counted(monkeypatch):
     """Number of times that a bridge's program is traced."""
-    count, travel = [0], bridges.travel
+    count, reach = [0], bridges.reach
 
     def counting(*args):
         count[0] += 1
-        return travel(*args)
+        return reach(*args)
 
-    monkeypatch.setattr(bridges, "travel", counting)
+    monkeypatch.setattr(bridges, "reach", counting)
     return count
 
 
