@@ -208,6 +208,15 @@ def positive_integer(value: Any, name: str, least: int = 1) -> int:
     return size
 
 
+def positive_integers(values: Any, name: str, count: int, whose: str) -> tuple[int, ...]:
+    """Static sizes, one for each of `count` things."""
+    numbers = known_float(values, name)
+    good = numbers.shape == (count,)
+    good = good and bool(np.all((numbers == np.round(numbers)) & (numbers >= 1) & (numbers < 2**31)))
+    require(good, f"`{name}` must be positive integers, one for each of {count} {whose}; got {words(values)}.")
+    return tuple(int(number) for number in numbers)
+
+
 def flag(value: Any, name: str) -> bool:
     """True or False, and nothing that is merely true or false to Python, such as the text "False"."""
     require(

@@ -328,6 +328,8 @@ def table() -> dict[str, Row]:
         "Tree.star": row(nb.Tree.star, lengths=("array", GRID), names=("names?", ["a", "b", "c"])),
         "Tree.with_lengths": row(TREE.with_lengths, lengths=("array", np.ones(4))),
         "Tree.scaled": row(TREE.scaled, rates=("array", np.ones(4))),
+        "Tree.num_steps": row(TREE.num_steps, longest=("setting", 0.5), multiple=("count", 2)),
+        "Tree.divided": row(TREE.divided, pieces=("array", np.array([1.0, 2.0, 1.0, 3.0]))),
         "Tree.clade": row(
             lambda names, stem=True: TREE.clade(*(names if isinstance(names, list) else [names]), stem=stem),
             names=("names", ["a", "b"]),

@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.linalg import block_diag
 
 import numpyro_bridges as nb
-from numpyro_bridges.distributions._tree import _problem, _simulated
+from numpyro_bridges.distributions._tree import _divided, _problem, _simulated
 from numpyro_bridges.infer import FunctionSpaceHMC
 from numpyro_bridges.trees._schedule import schedule
 
@@ -504,6 +504,7 @@ FORCED = {
     "three tips, 10 steps": (SMALL, 10, None),
     "six tips, 4 steps": (SEVEN, 4, None),
     "six tips, 10 steps": (SEVEN, 10, None),
+    "three tips, steps of their own": (SMALL, (2, 4, 6, 4), None),
     "a root that varies": (SMALL, 4, 1.5),
     "a root that varies and is seen": (SEEN_ROOT, 3, 1.5),
 }
@@ -513,7 +514,8 @@ FORCED = {
 def test_evidence_by_brute_force(name):
     """The mean weight, against forward simulation in NumPy weighed by the density of the data."""
     tree, num_steps, root = FORCED[name]
-    rng = np.random.default_rng(num_steps)
+    counts = np.broadcast_to(num_steps, tree.num_nodes - 1)
+    rng = np.random.default_rng(counts[-1])
     variance, x0, count = 0.3, 0.4, 400_000
     data = rng.normal(0.5, 0.4, (len(tree.observed), 1))
     depths, lengths = np.asarray(tree.depths), np.asarray(tree.lengths)
@@ -522,8 +524,8 @@ def test_evidence_by_brute_force(name):
         log_density += stats.norm(state[0], np.sqrt(variance)).logpdf(data[0, 0])
     for node in range(1, tree.num_nodes):
         x, t = state[tree.parents[node]], depths[tree.parents[node]]
-        dt = lengths[node - 1] / num_steps
-        for _ in range(num_steps):
+        dt = lengths[node - 1] / counts[node - 1]
+        for _ in range(counts[node - 1]):
             spread = 0.6 + 0.1 * np.cos(x)
             x = x + dt * (np.sin(x) + 0.2 * t) + np.sqrt(dt) * spread * rng.normal(size=count)
             t = t + dt
@@ -538,7 +540,7 @@ def test_evidence_by_brute_force(name):
     law = nb.DiffusionTree(
         sine(1.0), np.array([x0]), nb.InexactMatch(variance), tree=tree, num_steps=num_steps, root_covariance=root
     )
-    z = jr.normal(jr.key(num_steps), (6000, *law.noise_prior().shape()))
+    z = jr.normal(jr.key(counts[-1]), (6000, *law.noise_prior().shape()))
     log_weights = jax.jit(jax.vmap(lambda z: law.given(z).log_prob(data)))(z)
     own = np.exp(log_weights)
     own_error = own.std() / np.sqrt(len(own))
@@ -555,9 +557,11 @@ KINDS = {
     "one branch": (nb.ExactMatch(), nb.Tree.star([1.2]), None),
     "a root that varies": (nb.InexactMatch(0.1), ROOTED, None),
     "fewer noises than states": (nb.InexactMatch(0.1), ROOTED, None),
+    "steps of their own": (nb.ExactMatch(), nb.Tree.from_newick("((a:1,b:1.5):2,g:2):.3;"), None),
 }
 OTHERS = {"a root that varies": {"root_covariance": 0.2 * PRIOR}}
 OTHERS["fewer noises than states"] = {"root_covariance": np.array([0.4, 0.2, 0.3])}
+OTHERS["steps of their own"] = {"num_steps": (2, 4, 2, 6, 4)}
 NARROW = nb.SDE(lambda t, x, a: -x, lambda t, x, a: jnp.stack([jnp.cos(x[:, 0]), jnp.ones(3)], 1))
 
 
@@ -566,7 +570,7 @@ def test_the_way_back_to_the_noise(name, key):
     """Simulated paths are those of their noise; paths meet at the nodes, and end in what is seen exactly."""
     match, tree, guide = KINDS[name]
     sde = NARROW if name.startswith("fewer") else FLOW
-    law = nb.DiffusionTree(sde, X0, match, tree=tree, num_steps=3, guide=guide, **OTHERS.get(name, {}))
+    law = nb.DiffusionTree(sde, X0, match, tree=tree, guide=guide, **({"num_steps": 3} | OTHERS.get(name, {})))
 
     @jax.jit
     def there_and_back(key):
@@ -577,8 +581,9 @@ def test_the_way_back_to_the_noise(name, key):
 
     seen, paths, again, log_weight = there_and_back(key)
     np.testing.assert_allclose(again, paths, atol=1e-10)
-    assert (name in OTHERS) == (np.max(np.abs(paths[0, 0] - X0)) > 0)
+    assert ("root_covariance" in OTHERS.get(name, {})) == (np.max(np.abs(paths[0, 0] - X0)) > 0)
     assert np.isfinite(log_weight)
+    tree = _divided(law.parts)
     walk = schedule(tree.parents, tree.observed)
     for i, node in enumerate(walk.active):
         parent = tree.parents[node]
@@ -587,6 +592,42 @@ def test_the_way_back_to_the_noise(name, key):
     if isinstance(match, nb.ExactMatch):
         ends = [paths[walk.active.index(node), -1] for node in tree.observed]
         np.testing.assert_allclose(ends, seen, atol=1e-12)
+
+
+def test_steps_of_their_own(key):
+    """Those of a tree whose branches are divided; by branch and by node, whatever the pieces."""
+    sde = nb.SDE(lambda t, x, a: jnp.sin(x) - t, lambda t, x, a: 0.6 + 0.1 * jnp.cos(x[:, 0]))
+    counts = SMALL.num_steps(0.15)
+    assert counts == (4, 4, 6, 4)
+    settings = {"guide": nb.RecedingGuide(), "root_covariance": 0.3, "t0": 0.5}
+    law = nb.DiffusionTree(sde, X0, nb.InexactMatch(0.1), tree=SMALL, num_steps=counts, **settings)
+    divided = SMALL.divided((2, 2, 3, 2))
+    pieces = nb.DiffusionTree(sde, X0, nb.InexactMatch(0.1), tree=divided, num_steps=2, **settings)
+    z = jr.normal(key, law.noise_prior().shape())
+    assert law.noise_blocks.sizes == (1, 4, 4, 6, 4)
+
+    @jax.jit
+    def found(z):
+        own, other = law.given(z), pieces.given(z)
+        return (
+            (own.log_prob(DATA[:3]), jnp.sum(own._log_prob_by_block(DATA[:3]))),
+            (other.log_prob(DATA[:3]), jnp.sum(other._log_prob_by_block(DATA[:3]))),
+            (own._log_prob_by_block(DATA[:3]), other._log_prob_by_block(DATA[:3])),
+            (own.log_prob_by_node(DATA[:3]), other.log_prob_by_node(DATA[:3])),
+            (own.nodes(DATA[:3]), other.nodes(DATA[:3])),
+            (own.path(DATA[:3]), other.path(DATA[:3])),
+        )
+
+    own, other, blocks, by_node, nodes, paths = found(z)
+    np.testing.assert_allclose(own + other, own[0], rtol=1e-12)
+    branch = [0, 1, 1, 2, 2, 3, 3, 3, 4, 4]
+    np.testing.assert_allclose(blocks[0], np.bincount(branch, blocks[1]), rtol=1e-12)
+    np.testing.assert_allclose(by_node[0], blocks[0][np.array([2, 3, 4])], rtol=1e-12)  # a tip's own is its branch
+    np.testing.assert_allclose(by_node[1], by_node[0], rtol=1e-12)
+    np.testing.assert_array_equal(nodes[0], nodes[1][np.array([0, 2, 4, 7, 9])])
+    np.testing.assert_array_equal(paths[0][2], np.concatenate([paths[1][4], *paths[1][5:7, 1:]]))
+    assert np.all(np.isnan(paths[0][0, 5:])) and np.all(np.isfinite(paths[0][0, :5]))
+    np.testing.assert_allclose(law.times[2], 0.9 + 0.7 * np.arange(7) / 6)
 
 
 @pytest.mark.parametrize("columns", [(), (2,)], ids=["vectors", "columns"])
@@ -731,6 +772,8 @@ WRONG = {
     "no prior": (lambda: law(root_covariance=-1.0), "`root_covariance` must be positive definite"),
     "steps": (lambda: law(sde=sine(1.0)), "`num_steps` must be given"),
     "no steps": (lambda: law(num_steps=0), "`num_steps` must be a positive integer; got 0"),
+    "steps of other branches": (lambda: law(num_steps=(2, 3)), "`num_steps` must be positive integers, one for each of "),
+    "no steps somewhere": (lambda: law(num_steps=[2, 2, 0, 2]), "`num_steps` must be positive integers"),
     "inner exact": (lambda: law(match=nb.ExactMatch()), "1 of the seen nodes are no tips"),
     "several exact": (
         lambda: law(match=nb.ExactMatch(), tree=TREE.observing(list("aabcc"))),

@@ -9,6 +9,7 @@ A bridge is the tree with one branch, a time series is a chain.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -17,7 +18,16 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import ArrayLike
 
-from .._checks import as_float, concrete, positive_integer, require, require_finite, require_instance, words
+from .._checks import (
+    as_float,
+    concrete,
+    positive_integer,
+    positive_integers,
+    require,
+    require_finite,
+    require_instance,
+    words,
+)
 from .._types import RealScalar, State
 from ..conditioning import AbstractMatch, fused
 from ..guiding import AbstractGuide
@@ -32,9 +42,20 @@ from ._noise_driven import AbstractNoiseDriven
 class _Settings(eqx.Module):
     """What is known of a law before tracing."""
 
-    num_steps: int = eqx.field(static=True)
+    num_steps: tuple[int, ...] = eqx.field(static=True)
+    """On each branch of the tree."""
     per_row: tuple[str, ...] = eqx.field(static=True)
     per_edge: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def steps_together(self) -> int:
+        """Steps that every branch has, or every piece of it: a branch with more is a chain of branches."""
+        return int(np.gcd.reduce(self.num_steps))
+
+    @property
+    def pieces(self) -> np.ndarray:
+        """Of each branch of the tree."""
+        return np.array(self.num_steps) // self.steps_together
 
 
 class DiffusionTree(AbstractNoiseDriven):
@@ -59,15 +80,16 @@ class DiffusionTree(AbstractNoiseDriven):
       its own `mask` of an `InexactMatch`. Rows of one node are independent given its state: the variance of the match
       is then the variation within species.
     - `tree`: a `Tree`. Its lengths may be parameters.
-    - `num_steps`: steps on each branch; 1 unless given where the SDE has its exact transition (`LinearSDE`,
-      `BrownianMotion`).
+    - `num_steps`: steps on each branch, one number, or `(num_nodes - 1,)` of them in the order of `tree.lengths`:
+      `tree.num_steps(longest)` counts those that are in proportion to the lengths. 1 unless given where the SDE has its
+      exact transition (`LinearSDE`, `BrownianMotion`).
     - `t0`: the time at the root.
     - `guide`: as for `GuidedBridge`, for every branch.
     - `batch_shape`, `batched`: several trees with parts of their own, as for `DiffusionEndpoint`.
 
     **Shapes:** `event_shape` is `(m, ...)`, one observation for each entry of `tree.observed`; data come in that order
-    by `tree.rows`. The noise has shape `(branches * num_steps, k, dim)`, branches in preorder, those alone that lead to
-    something seen. With a prior of the root ⌈n / k⌉ rows are in front.
+    by `tree.rows`. The noise has shape `(rows, k, dim)`, a row for each step, branches in preorder, those alone that
+    lead to something seen. With a prior of the root ⌈n / k⌉ rows are in front.
 
     For a linear SDE with the default guide the density does not depend on the noise: it is the likelihood.
 
@@ -82,7 +104,7 @@ class DiffusionTree(AbstractNoiseDriven):
         match: AbstractMatch,
         *,
         tree: Tree,
-        num_steps: int | None = None,
+        num_steps: int | Sequence[int] | None = None,
         t0: RealScalar = 0.0,
         guide: AbstractGuide | None = None,
         root_covariance: ArrayLike | None = None,
@@ -114,7 +136,7 @@ class DiffusionTree(AbstractNoiseDriven):
             num_steps is not None or sde.has_exact_transition,
             "`num_steps` must be given, for every branch: this SDE is stepped by Euler's scheme.",
         )
-        settings = _Settings(positive_integer(1 if num_steps is None else num_steps, "num_steps"), own, own_edges)
+        settings = _Settings(_counts(1 if num_steps is None else num_steps, tree), own, own_edges)
         batch_shape = as_shape(batch_shape, "batch_shape")
         declared = names_of(batched)
         start = as_float(t0, "t0")
@@ -125,11 +147,11 @@ class DiffusionTree(AbstractNoiseDriven):
         one = _simplest(one_of(parts, names, batch_shape, (0,) * len(batch_shape)))
         datum = jnp.zeros((len(tree.observed), *seen_shape(one)))
         _check_condition(one, datum)
-        close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.num_steps + 1), own_edges)
-        branches = len(tree.active)
+        close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.steps_together + 1), own_edges)
+        num_steps_in_all = sum(settings.num_steps[node - 1] for node in tree.active)
         columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
         k = one["sde"].noise_size(one["x0"])
-        noise_shape = (_root(one).num_rows(k) + branches * settings.num_steps, k, columns)
+        noise_shape = (_root(one).num_rows(k) + num_steps_in_all, k, columns)
         super().__init__(
             parts, names, declared is not None, batch_shape, datum.shape, noise_shape, validate_args, ("t0",)
         )
@@ -144,16 +166,19 @@ class DiffusionTree(AbstractNoiseDriven):
         """The root, where it has a prior, and the branches that have noise, in preorder."""
         tree, num_steps = self.tree, self.parts["settings"].num_steps
         branches = tree.active
-        root = self._noise_shape[0] - num_steps * len(branches)
+        sizes = tuple(num_steps[node - 1] for node in branches)
+        root = self._noise_shape[0] - sum(sizes)
         nodes = (0, *branches) if root else branches
         number = {node: i for i, node in enumerate(nodes)}
-        sizes = (num_steps,) * len(branches)
         above = tuple(number.get(tree.parents[node], -1) for node in nodes)
         return NoiseBlocks((root, *sizes) if root else sizes, above)
 
     @property
     def times(self):
-        """The times of `path`, `(branches, num_steps + 1)`; with the batch axes in front where trees have their own."""
+        """The times of `path`, `(branches, num_steps + 1)`, NaN behind the end of a branch with fewer steps than others.
+
+        With the batch axes in front where trees have their own.
+        """
         if {"tree", "t0"}.isdisjoint(self._batched):
             return _times(self.parts)
         return self._over_batch(_times, self._full_shape)
@@ -178,7 +203,7 @@ class DiffusionTree(AbstractNoiseDriven):
         """Paths to `observed` that the bound noise drives, batch axes and then `(branches, num_steps + 1, n, dim)`.
 
         Branches in preorder, those that lead to something seen; the first state of each is the last of its parent's.
-        NaN where the law is masked.
+        NaN behind the end of a branch with fewer steps than others, and where the law is masked.
         """
         return self._paths_to(observed, _paths)
 
@@ -206,7 +231,13 @@ class DiffusionTree(AbstractNoiseDriven):
 
     @staticmethod
     def _log_weights(parts, value, noise):
-        return _problem(parts, value).log_weights(_driving(parts, noise))
+        terms = _problem(parts, value).log_weights(_driving(parts, noise))
+        tree, pieces = parts["tree"], parts["settings"].pieces
+        active = np.array(tree.active)
+        branch = np.repeat(np.arange(len(active)), pieces[active - 1])
+        root = len(terms) - len(branch)  # 1 where it has a prior
+        block = np.concatenate([np.zeros(root, int), root + branch])
+        return jnp.zeros((root + len(active),), terms.dtype).at[block].add(terms)
 
     @staticmethod
     def _placeholder(parts, value):
@@ -220,6 +251,15 @@ class DiffusionTree(AbstractNoiseDriven):
             match = jax.tree.map(lambda a, i=i: a[i], parts["match"]) if own else parts["match"]
             for value in row:
                 match.at(value)
+
+
+def _counts(num_steps, tree: Tree) -> tuple[int, ...]:
+    """Of each branch."""
+    count = tree.num_nodes - 1
+    several = isinstance(num_steps, (list, tuple)) or getattr(num_steps, "ndim", 0) > 0
+    if several:
+        return positive_integers(num_steps, "num_steps", count, "branches")
+    return (positive_integer(num_steps, "num_steps"),) * count
 
 
 def _simplest(parts):
@@ -288,17 +328,39 @@ def _problem(parts, value) -> TreeProblem:
 
 
 def _unled(parts, value) -> TreeProblem:
-    match, x0, tree, settings = parts["match"], parts["x0"], parts["tree"], parts["settings"]
+    match, x0, tree, settings = parts["match"], parts["x0"], _divided(parts), parts["settings"]
     sde, sdes = parts["sde"], None
     if "sde" in settings.per_edge:
-        sde, sdes = _first(sde), sde
+        pieces = settings.pieces
+        branch = np.repeat(np.arange(len(pieces)), pieces)
+        sde, sdes = _first(sde), jax.tree.map(lambda a: a[branch] if eqx.is_array(a) else a, sde)
     own = "match" in settings.per_row
     sizes = tuple(Counter(tree.observed).values())
     if max(sizes) > 1:
         conditions = fused(match, value, sizes, own, sde, x0)
     else:
         conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(match, value)
-    return TreeProblem.of(sde, parts["guide"], _root(parts), tree, conditions, settings.num_steps, parts["t0"], sdes)
+    num_steps = settings.steps_together
+    return TreeProblem.of(sde, parts["guide"], _root(parts), tree, conditions, num_steps, parts["t0"], sdes)
+
+
+def _divided(parts) -> Tree:
+    """The tree with branches that all have the same number of steps."""
+    pieces = parts["settings"].pieces
+    return parts["tree"].divided(pieces) if np.any(pieces > 1) else parts["tree"]
+
+
+def _along(parts, by_piece):
+    """What is known at the states of all pieces, `(pieces, steps together + 1, ...)`, for each branch as a whole."""
+    settings, active = parts["settings"], np.array(parts["tree"].active)
+    together = settings.steps_together
+    counts, pieces = np.array(settings.num_steps)[active - 1], settings.pieces[active - 1]
+    first = np.cumsum(pieces) - pieces
+    state = np.arange(max(counts) + 1)
+    piece = np.maximum(state - 1, 0) // together  # that it is in or at the end of
+    inside = state <= counts[:, None]
+    found = by_piece[np.where(inside, first[:, None] + piece, 0), state - together * piece]
+    return jnp.where(inside.reshape(inside.shape + (1,) * (found.ndim - 2)), found, jnp.nan)
 
 
 def _root(parts) -> Root:
@@ -315,9 +377,9 @@ def _by_node(parts, value, noise):
 
 
 def _times(parts):
-    tree = parts["tree"]
+    tree = _divided(parts)
     starts = parts["t0"] + tree.depths[np.array(tree.parents)[list(tree.active)]]
-    return starts[:, None] + _without_data(parts).grids
+    return _along(parts, starts[:, None] + _without_data(parts).grids)
 
 
 def _without_data(parts) -> TreeProblem:
@@ -327,18 +389,19 @@ def _without_data(parts) -> TreeProblem:
 
 
 def _paths(parts, value, noise):
-    return _problem(parts, value).paths(_driving(parts, noise))
+    return _along(parts, _problem(parts, value).paths(_driving(parts, noise)))
 
 
 def _nodes(parts, value, noise):
     problem = _problem(parts, value)
-    return problem.at_nodes(problem.paths(_driving(parts, noise)))
+    states = problem.at_nodes(problem.paths(_driving(parts, noise)))
+    return states[np.concatenate([[0], np.cumsum(parts["settings"].pieces)])]
 
 
 def _simulated(parts, key):
     """What is seen, and the paths of the branches that lead to it."""
     key_path, key_seen = jr.split(key)
-    tree, match, own = parts["tree"], parts["match"], parts["settings"].per_row
+    tree, match, own = _divided(parts), parts["match"], parts["settings"].per_row
     problem = _without_data(parts)
     sde, x0 = problem.sde, problem.x0
     shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])

@@ -16,6 +16,7 @@ import numpy as np
 from .._checks import as_path, positive_integer, require, words
 
 _QUOTED_OR_COMMENT = re.compile(r"'(?:[^']|'')*'|\[[^\]]*\]")
+_UNROOTED = re.compile(r"(?im)^(\s*)utree\b")
 _TWO_LENGTHS = re.compile(r":[^,();:]*(:)")
 
 
@@ -76,6 +77,8 @@ def _read(text: str, place: str, preserve_underscores: bool) -> Any:
     import dendropy
 
     nexus = _is_nexus(text)
+    if nexus:  # PAML writes rooted trees so; DendroPy does not know the word
+        text = _UNROOTED.sub(r"\1 tree", text)
     settings = dict(preserve_underscores=preserve_underscores, suppress_internal_node_taxa=True)
     settings |= dict(rooting="force-rooted")
     if not nexus:  # names that are given twice are ours to refuse

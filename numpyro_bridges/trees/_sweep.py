@@ -18,6 +18,7 @@ bias. Where the process is linear and the messages are its own, Ψ is the same n
 root.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -181,15 +182,27 @@ class TreeProblem(eqx.Module):
 
     @full_precision
     def log_likelihoods(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, " seen"]:
-        """For each seen node what its datum is given its state, or, at an end, the term of its branch."""
+        """For each seen node what its datum is given its state, or, at an end, the terms of what leads to it alone."""
         schedule, place = self.schedule, {node: i for i, node in enumerate(self.schedule.active)}
         at_inner = np.array([place[node] for node in schedule.inner], int)
         paths, log_weights = self.down(self.up(), noise)
         densities = self._log_density_inside(jnp.concatenate([paths[:1, 0], paths[at_inner, -1]]))
         by_node = jnp.zeros((len(self.parents),), self.x0.dtype)
-        by_node = by_node.at[np.array(schedule.active)].set(log_weights[-len(schedule.active) :])
+        ends = self._leads_to(schedule.active)
+        by_node = by_node.at[ends].add(log_weights[-len(ends) :])
         by_node = by_node.at[np.array((0, *schedule.inner))].set(densities)
         return by_node[np.array(self.observed)]
+
+    def _leads_to(self, nodes: Sequence[int]) -> np.ndarray:
+        """For each of all active nodes the last one below it to which nothing but its branch leads."""
+        last = {}
+        above = Counter(self.parents[node] for node in nodes)
+        for node in reversed(nodes):
+            last.setdefault(node, node)
+            parent = self.parents[node]
+            if above[parent] == 1 and parent not in self.observed:
+                last[parent] = last[node]
+        return np.array([last[node] for node in nodes])
 
     @property
     def grids(self) -> Float[Array, "branches K+1"]:

@@ -11,7 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._checks import as_float, concrete, flag, known_float, require, require_instance, words
+from .._checks import (
+    as_float,
+    concrete,
+    flag,
+    known_float,
+    known_number,
+    positive_integer,
+    positive_integers,
+    require,
+    require_instance,
+    words,
+)
 from ._newick import parse
 from ._schedule import schedule
 
@@ -305,6 +316,38 @@ class Tree(eqx.Module):
         lengths = jnp.zeros((len(kept) - 1,), self.lengths.dtype)
         lengths = lengths.at[np.array(owners)].add(self.lengths[np.array(branches)])
         return Tree(parents, lengths, [self.names[node] for node in kept])
+
+    def num_steps(self, longest: float, multiple: int = 2) -> tuple[int, ...]:
+        """How many steps of equal length each branch needs so that none is longer, for `DiffusionTree(num_steps=)`.
+
+        Numbers are multiples of `multiple`: branches are led in pieces of that many steps, and fewer pieces are faster.
+        """
+        longest = known_number(longest, "longest", "a positive number", lambda value: value > 0)
+        multiple = positive_integer(multiple, "multiple")
+        lengths = concrete(self.lengths)
+        if lengths is None:
+            raise ValueError(
+                "`tree` must have lengths that are known, since programs have fixed numbers of steps; these are "
+                "traced. Count the steps outside of the model, on a tree of typical lengths."
+            )
+        pieces = np.ceil(lengths / (multiple * longest) * (1 - 1e-9))  # not one more for rounding
+        return tuple(int(multiple * max(count, 1)) for count in pieces)
+
+    def divided(self, pieces: Sequence[int]) -> "Tree":
+        """The same tree with its branches divided into equal pieces, `(num_nodes - 1,)` numbers of them.
+
+        The nodes between are not seen and have no names. Node i becomes node `sum(pieces[:i])`.
+        """
+        pieces = np.array(positive_integers(pieces, "pieces", self.num_nodes - 1, "branches"))
+        place = np.concatenate([[0], np.cumsum(pieces)])
+        parents = np.arange(-1, place[-1])  # a piece begins where the one before it ends
+        parents[1 + place[:-1]] = place[np.array(self.parents[1:], int)]  # or, the first, where the branch does
+        names: list[str | None] = [None] * len(parents)
+        for node, name in enumerate(self.names):
+            names[place[node]] = name
+        branch = np.repeat(np.arange(len(pieces)), pieces)
+        lengths = (self.lengths / pieces.astype(self.lengths.dtype))[branch]
+        return Tree(parents, lengths, names, [int(place[node]) for node in self.observed])
 
     def rows(
         self,
