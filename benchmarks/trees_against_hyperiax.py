@@ -143,10 +143,10 @@ TERNARY = nb.Tree.from_parents([-1, 0, 0, 0] + [1 + i // 3 for i in range(9)], n
 AMPLITUDE, LENGTH_SCALE = 0.1, 0.25
 
 
-def law_of(amplitude, length_scale, num_steps):
+def law_of(amplitude, length_scale, num_steps, guide=None):
     space = nb.Landmarks(POINTS, DIM, weights=1.0)
     flow = nb.KunitaFlow(space, covariance=nb.MaternKernel(amplitude, length_scale))
-    return nb.DiffusionTree(flow, CIRCLE, nb.InexactMatch(VARIANCE), tree=TERNARY, num_steps=num_steps)
+    return nb.DiffusionTree(flow, CIRCLE, nb.InexactMatch(VARIANCE), tree=TERNARY, num_steps=num_steps, guide=guide)
 
 
 class Theirs:
@@ -200,11 +200,16 @@ def weight(arguments):
     theirs = Theirs(data, num_steps)
     shape = law_of(AMPLITUDE, LENGTH_SCALE, num_steps).noise_prior().shape()
 
-    def ours(z, amplitude, length_scale):
-        return law_of(amplitude, length_scale, num_steps).given(z).log_prob(data)
+    def by(guide):
+        def ours(z, amplitude, length_scale):
+            return law_of(amplitude, length_scale, num_steps, guide).given(z).log_prob(data)
+
+        return ours, jr.normal(jr.key(0), (64, *shape))
 
     programs = {
-        "numpyro_bridges": (ours, jr.normal(jr.key(0), (64, *shape))),
+        "numpyro_bridges, geodesic guide": by(nb.GeodesicGuide()),
+        "numpyro_bridges, receding guide": by(nb.RecedingGuide()),
+        "numpyro_bridges, frozen guide": by(nb.FrozenGuide()),
         "hyperiax": (lambda *args: theirs(*args)[0], jr.normal(jr.key(0), (64, theirs.num_noises))),
     }
     for name, (value, z) in programs.items():

@@ -772,7 +772,7 @@ WRONG = {
     "no prior": (lambda: law(root_covariance=-1.0), "`root_covariance` must be positive definite"),
     "steps": (lambda: law(sde=sine(1.0)), "`num_steps` must be given"),
     "no steps": (lambda: law(num_steps=0), "`num_steps` must be a positive integer; got 0"),
-    "steps of other branches": (lambda: law(num_steps=(2, 3)), "`num_steps` must be positive integers, one for each of "),
+    "steps of other branches": (lambda: law(num_steps=(2, 3)), "`num_steps` must be positive integers, one for each"),
     "no steps somewhere": (lambda: law(num_steps=[2, 2, 0, 2]), "`num_steps` must be positive integers"),
     "inner exact": (lambda: law(match=nb.ExactMatch()), "1 of the seen nodes are no tips"),
     "several exact": (

@@ -175,7 +175,7 @@ class DiffusionTree(AbstractNoiseDriven):
 
     @property
     def times(self):
-        """The times of `path`, `(branches, num_steps + 1)`, NaN behind the end of a branch with fewer steps than others.
+        """The times of `path`, `(branches, num_steps + 1)`, NaN behind the end of branches with fewer steps.
 
         With the batch axes in front where trees have their own.
         """

@@ -1,14 +1,19 @@
 """In which order a tree's branches are walked, and where what is still needed is kept meanwhile.
 
-Children are visited before their parents on the way up, after them on the way down, the largest subtree last on the way
-down and so first on the way up. A node is then needed no more when its last subtree begins, and at most log₂(number of
-nodes) of them are kept at a time: memory and derivatives cost no more than the branches, whatever the shape.
+Branches are walked in rounds: on the way down those of a round start at nodes of earlier ones, the way up is the
+reverse. Within rounds of few places the order is depth first, the largest subtree last. A node is then needed no more
+when its last subtree begins, and not many more than log₂(number of nodes) of them are kept at a time: memory and
+derivatives cost no more than the branches, whatever the shape.
 """
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+
+_MAX_WIDTH = 32
+_MAX_IDLE = 0.5
+"""Places of rounds that are left empty, relative to those that are taken."""
 
 
 class Schedule(NamedTuple):
@@ -20,13 +25,20 @@ class Schedule(NamedTuple):
     """Inner nodes but the root, in the order of the way down."""
     active: tuple[int, ...]
     """Nodes but the root that have something seen below or at them, in preorder: those that have noise."""
+    rounds: tuple[tuple[int, ...], ...]
+    """For each round of the way down the places in `inner` of its nodes."""
     num_slots: int
     slot: tuple[int, ...]
     """For each node of `inner` where its state is kept, `num_slots` where nothing inner hangs on it."""
     parent_slot: tuple[int, ...]
     """For each node of `inner` where its parent's state is kept; that of the root is in slot 0."""
-    first: tuple[bool, ...]
-    """For each node of `inner` whether it is the first to reach its parent on the way up."""
+
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """`rounds` as an array, a place of no node holding the round's first once more, and which of them are nodes."""
+        width = max(map(len, self.rounds), default=1)
+        filled = [nodes + nodes[:1] * (width - len(nodes)) for nodes in self.rounds]
+        taken = [[i < len(nodes) for i in range(width)] for nodes in self.rounds]
+        return np.array(filled, int).reshape(-1, width), np.array(taken, bool).reshape(-1, width)
 
 
 def schedule(parents: Sequence[int], observed: Sequence[int]) -> Schedule:
@@ -44,29 +56,19 @@ def schedule(parents: Sequence[int], observed: Sequence[int]) -> Schedule:
     children: dict[int, list[int]] = {node: [] for node in range(count)}
     for node in active[has_child[active]]:
         children[int(above[node])].append(int(node))
-    order = _heavy_last(children, size)
-    slot_of, taken, free = {0: 0}, 1, []
-    first, remaining = {}, {node: len(own) for node, own in children.items()}
-    slots, parent_slots = [], []
-    for node in order:
-        parent = int(above[node])
-        parent_slots.append(slot_of[parent])
-        first[node] = remaining[parent] == 1  # the last on the way down
-        remaining[parent] -= 1
-        if not remaining[parent] and parent:  # the root's place is its own
-            free.append(slot_of[parent])
-        if children[node]:
-            slot_of[node] = free.pop() if free else taken
-            taken = max(taken, slot_of[node] + 1)
-        slots.append(slot_of.get(node, -1))
+
+    rounds = _rounds(_heavy_last(children, size), parents)
+    order = [node for nodes in rounds for node in nodes]
+    place = {node: i for i, node in enumerate(order)}
+    slot_of, num_slots = _slots(rounds, parents, children)
     return Schedule(
         tuple(ends.tolist()),
         tuple(order),
         tuple(active.tolist()),
-        taken,
-        tuple(taken if slot < 0 else slot for slot in slots),
-        tuple(parent_slots),
-        tuple(first[node] for node in order),
+        tuple(tuple(place[node] for node in nodes) for nodes in rounds),
+        num_slots,
+        tuple(slot_of.get(node, num_slots) for node in order),
+        tuple(slot_of[parents[node]] for node in order),
     )
 
 
@@ -78,3 +80,48 @@ def _heavy_last(children: dict[int, list[int]], size: np.ndarray) -> list[int]:
             order.append(node)
         waiting.extend(sorted(children[node], key=lambda child: -size[child]))
     return order
+
+
+def _rounds(order: Sequence[int], parents: Sequence[int]) -> list[list[int]]:
+    """Nodes that are walked together: as many as can be without many empty places."""
+    width, rounds = 1, [[node] for node in order]
+    while 2 * width <= _MAX_WIDTH:
+        wider = _rounds_of(2 * width, order, parents)
+        if 2 * width * len(wider) > (1 + _MAX_IDLE) * len(order):
+            break
+        width, rounds = 2 * width, wider
+    return rounds
+
+
+def _rounds_of(width: int, order: Sequence[int], parents: Sequence[int]) -> list[list[int]]:
+    """Each node in the first round after its parent's that has a place."""
+    round_of, rounds = {0: -1}, []
+    first_free = 0
+    for node in order:
+        number = max(round_of[parents[node]] + 1, first_free)
+        while number < len(rounds) and len(rounds[number]) == width:
+            number += 1
+        if number == len(rounds):
+            rounds.append([])
+        rounds[number].append(node)
+        round_of[node] = number
+        while first_free < len(rounds) and len(rounds[first_free]) == width:
+            first_free += 1
+    return rounds
+
+
+def _slots(rounds, parents, children) -> tuple[dict[int, int], int]:
+    """For each node that has inner children a place until they have read it. A round reads before it writes."""
+    slot_of, taken, free = {0: 0}, 1, []
+    remaining = {node: len(own) for node, own in children.items()}
+    for nodes in rounds:
+        for node in nodes:
+            parent = parents[node]
+            remaining[parent] -= 1
+            if not remaining[parent] and parent:  # the root's place is its own
+                free.append(slot_of[parent])
+        for node in nodes:
+            if children[node]:
+                slot_of[node] = free.pop() if free else taken
+                taken = max(taken, slot_of[node] + 1)
+    return slot_of, taken

@@ -427,28 +427,24 @@ class TreeProblem(eqx.Module):
         `joined(total, branch)` gives what the node's branch, one of `branches`, tells its parent, and what is kept.
         """
         schedule = self.schedule
+        places, taken = schedule.places()
         kept = jax.tree.map(lambda a: jnp.zeros((schedule.num_slots + 1, *a.shape[1:]), a.dtype), own)
         kept = varying_like(kept, self.sde, self.branches, own)
-        order = schedule.inner[::-1]
 
         def step(kept, inputs):
-            own, branch, slot, parent_slot, first = inputs
-            below = jax.tree.map(lambda a: jnp.where(slot < schedule.num_slots, a[slot], 0.0), kept)
-            message, out = joined(jax.tree.map(jnp.add, own, below), branch)
+            own, branch, slot, parent_slot, taken = inputs
+            message, out = jax.vmap(joined)(jax.tree.map(lambda a, b: a + b[slot], own, kept), branch)
+            is_read = jnp.zeros((schedule.num_slots + 1,), bool).at[slot].set(True)
             kept = jax.tree.map(
-                lambda a, b: a.at[parent_slot].set(jnp.where(first, 0.0, a[parent_slot]) + b), kept, message
+                lambda a, b: _where(is_read, 0.0, a).at[parent_slot].add(_where(taken, b, 0.0)), kept, message
             )
             return kept, out
 
-        inputs = (
-            _picked(own, order),
-            jax.tree.map(lambda a: jnp.flip(a, 0), branches),
-            np.array(schedule.slot[::-1], int),
-            np.array(schedule.parent_slot[::-1], int),
-            np.array(schedule.first[::-1], bool),
-        )
-        kept, out = jax.lax.scan(step, kept, inputs)
-        return jax.tree.map(lambda a, b: a[0] + b[0], own, kept), jax.tree.map(lambda a: jnp.flip(a, 0), out)
+        slots = np.array(schedule.slot, int), np.array(schedule.parent_slot, int)
+        of_inner = _picked(own, schedule.inner), branches, *slots
+        inputs = *_picked(of_inner, places), taken
+        kept, out = jax.lax.scan(step, kept, inputs, reverse=True)
+        return jax.tree.map(lambda a, b: a[0] + b[0], own, kept), _picked_out(out, schedule)
 
     def log_evidence(self, up: UpwardPass) -> Float[Array, ""]:
         """The message at the root under its prior: the log likelihood itself where the process is linear."""
@@ -467,22 +463,27 @@ class TreeProblem(eqx.Module):
         inner, ends = schedule.inner, schedule.ends
         at_inner = np.array([place[node] for node in inner], int)
         at_ends = np.array([place[node] for node in ends], int)
-        states = jnp.zeros((schedule.num_slots + 1, *self.x0.shape), self.x0.dtype)
+        places, taken = schedule.places()
+        states = jnp.zeros((schedule.num_slots, *self.x0.shape), self.x0.dtype)
         states = varying_like(states.at[0].set(root), self.sde, self.branches, up, noise)
 
-        def step(states, inputs):
-            branch, plan, w, z, slot, parent_slot = inputs
-            x = states[parent_slot]
+        def inner_branch(branch, plan, w, z, x):
             ts = self._grid(branch.length, False)
             path, _, log_weight = travel(self._edge(branch), plan, ts, x - branch.anchor, z, w)
-            path = jnp.concatenate([x[None], branch.anchor[None] + path])
-            return states.at[slot].set(path[-1]), (path, log_weight)
+            return jnp.concatenate([x[None], branch.anchor[None] + path]), log_weight
 
-        inputs = (
-            self._of(inner), up.plans, up.data, noise[at_inner],
-            np.array(schedule.slot, int), np.array(schedule.parent_slot, int),
-        )  # fmt: skip
-        _, (inner_paths, inner_weights) = jax.lax.scan(step, states, inputs)
+        def step(states, inputs):
+            of_branches, slot, parent_slot = inputs
+            path, log_weight = jax.vmap(inner_branch)(*of_branches, states[parent_slot])
+            states = states.at[slot].set(path[:, -1], mode="drop", unique_indices=True)
+            return states, (path, log_weight)
+
+        of_inner = self._of(inner), up.plans, up.data, noise[at_inner]
+        slot, parent_slot = np.array(schedule.slot, int)[places], np.array(schedule.parent_slot, int)[places]
+        nowhere = schedule.num_slots + np.arange(places.shape[1])  # a place each, behind the last slot
+        slot = np.where(taken & (slot < schedule.num_slots), slot, nowhere)
+        _, out = jax.lax.scan(step, states, (_picked(of_inner, places), slot, parent_slot))
+        inner_paths, inner_weights = _picked_out(out, schedule)
         known = jnp.concatenate([root[None], inner_paths[:, -1]])
         number = {0: 0} | {node: i + 1 for i, node in enumerate(inner)}
         starts = known[np.array([number[self.parents[node]] for node in ends])]
@@ -518,7 +519,19 @@ class TreeProblem(eqx.Module):
         return jnp.zeros((len(inner),), self.x0.dtype).at[np.array(chosen)].set(densities)
 
 
-def _picked(tree, rows: Sequence[int]):
+def _picked(tree, rows):
     """Some rows of every array; a scan or a map over none of them is none."""
     return jax.tree.map(lambda a: a[np.array(rows, int)], tree)
 
+
+def _picked_out(by_round, schedule: Schedule):
+    """For each inner node what its round gave, in the order of the schedule."""
+    places, taken = schedule.places()
+    at = np.flatnonzero(taken)[np.argsort(places[taken])]
+    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[at], by_round)
+
+
+def _where(rows, there, elsewhere):
+    """By rows of arrays."""
+    array = there if jnp.ndim(there) else elsewhere
+    return jnp.where(rows.reshape(-1, *(1,) * (array.ndim - 1)), there, elsewhere)
