@@ -1,11 +1,13 @@
 """Is the posterior of each kernel calibrated? Simulation-based calibration (Talts and others, 2018).
 
 Parameters are drawn from the prior, data simulated forward, and posterior draws ranked against the truth: each
-parameter, a functional of the path (its middle, on average over points) and the log joint density of all. Ranks of an
+parameter, a functional of the path (its middle, on average over points) and the log joint density of all; on a tree a
+coordinate of an ancestor and the log likelihood, which shows data that are thrown away. Ranks of an
 exact sampler are uniform; their ECDF stays within a simultaneous 95 % band (Säilynoja, Bürkner and Vehtari, 2022).
 Of four statistics one leaves its band by chance in one run of six, so each has a p-value too, `uniformity`.
 
-Two models: a nonlinear scalar SDE, and a Kunita flow of two landmarks. JSON lines, and a plot of the ECDF differences.
+Three models: a nonlinear scalar SDE, a Kunita flow of two landmarks, and one of four on a tree of four tips. JSON lines,
+and a plot of the ECDF differences.
 
     python benchmarks/calibration.py --output output          # all kernels, 256 replicates each
     python benchmarks/calibration.py --quick --kernels FunctionSpaceHMC
@@ -58,11 +60,23 @@ def landmarks(v=None):
     nb.sample("v", law, obs=v)
 
 
+TREE = nb.Tree.from_newick("((a:.4,b:.5):.5,(c:.6,d:.2):.3);")
+
+
+def tree(v=None):
+    amplitude = numpyro.sample("amplitude", dist.LogNormal(-1.2, 0.4))
+    length_scale = numpyro.sample("length_scale", dist.LogNormal(-0.3, 0.3))
+    flow = nb.KunitaFlow(nb.Landmarks(4, 2), nb.GaussianKernel(amplitude, length_scale))
+    x0 = np.array([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
+    law = nb.DiffusionTree(flow, x0, nb.InexactMatch(0.002), tree=TREE, num_steps=TREE.num_steps(0.1))
+    nb.sample("v", law, obs=v)
+
+
 def with_nuts(kernel, **settings):
     return lambda model: Gibbs([(kernel(model, **settings), noise_sites), (NUTS(model), None)])
 
 
-MODELS = {"sine": sine, "landmarks": landmarks}
+MODELS = {"sine": sine, "landmarks": landmarks, "tree": tree}
 # Kernel, draws of the warm-up, draws, draws between those that are ranked.
 # Ranks are uniform among independent draws only: a quick run keeps every draw's distance and ranks fewer of them.
 KERNELS = {
@@ -75,13 +89,18 @@ KERNELS = {
 
 
 def statistics(model, z, v):
-    """What is ranked: parameters, middle of the path, log joint density of (θ, z, v)."""
+    """What is ranked: parameters, a functional of the path, log joint density of (θ, z, v)."""
     trace = numpyro.handlers.trace(numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), z)).get_trace(v)
     sites = [site for site in trace.values() if site["type"] == "sample"]
     log_joint = sum(jnp.sum(site["fn"].log_prob(site["value"])) for site in sites)
-    path = trace["v"]["fn"].path(v)
+    law = trace["v"]["fn"]
     scalars = {name: value for name, value in z.items() if name != "v_noise"}
-    return scalars | {"middle of the path": jnp.mean(path[len(path) // 2]), "log joint density": log_joint}
+    if isinstance(law, nb.DiffusionTree):
+        scalars |= {"coordinate of an ancestor": law.nodes(v)[1, 0, 0], "log likelihood": law.log_prob(v)}
+    else:
+        path = law.path(v)
+        scalars["middle of the path"] = jnp.mean(path[len(path) // 2])
+    return scalars | {"log joint density": log_joint}
 
 
 def ranks(name, kernel, model, num_replicates, num_warmup, num_draws, thin, seed=0):
@@ -153,13 +172,16 @@ def plot(rows, path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    columns = max(len(row["ranks"]) for row in rows)
     figure, axes = plt.subplots(
-        len(rows), len(rows[0]["ranks"]), figsize=(11, 1.7 * len(rows)), sharex=True, sharey=True, squeeze=False
+        len(rows), columns, figsize=(11, 1.7 * len(rows)), sharex=True, sharey=True, squeeze=False
     )
     for line, row in zip(axes, rows, strict=True):
         width = band(row["replicates"], row["num_ranks"])
         x = np.arange(1, row["num_ranks"]) / row["num_ranks"]
-        for axis, (statistic, found) in zip(line, row["ranks"].items(), strict=True):
+        for axis in line[len(row["ranks"]) :]:
+            axis.set_axis_off()
+        for axis, (statistic, found) in zip(line, row["ranks"].items(), strict=False):
             axis.fill_between(x, -width, width, color="0.85")
             axis.plot(x, difference(np.array(found), row["num_ranks"]), drawstyle="steps-post")
             axis.set_title(f"{row['kernel']}, {row['model']}\n{statistic}", fontsize=6)

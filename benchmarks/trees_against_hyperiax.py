@@ -1,6 +1,6 @@
 """Inference on trees beside hyperiax 3.0, on the two trees of its notebooks.
 
-    pip install hyperiax
+    pip install ".[benchmarks]"
     python benchmarks/trees_against_hyperiax.py [--quick] [--parts gaussian weight kunita] [--iterations 2000]
 
 `gaussian`: a binary tree of 16 leaves, Brownian motion, two variances with priors: NUTS by both, beside a grid.
