@@ -6,8 +6,8 @@ coordinate of an ancestor and the log likelihood, which shows data that are thro
 exact sampler are uniform; their ECDF stays within a simultaneous 95 % band (Säilynoja, Bürkner and Vehtari, 2022).
 Of four statistics one leaves its band by chance in one run of six, so each has a p-value too, `uniformity`.
 
-Three models: a nonlinear scalar SDE, a Kunita flow of two landmarks, and one of four on a tree of four tips. JSON lines,
-and a plot of the ECDF differences.
+Three models: a nonlinear scalar SDE, a Kunita flow of two landmarks, and one of four on a tree of four tips. JSON
+lines, and a plot of the ECDF differences.
 
     python benchmarks/calibration.py --output output          # all kernels, 256 replicates each
     python benchmarks/calibration.py --quick --kernels FunctionSpaceHMC

@@ -32,6 +32,8 @@ from numpyro.infer.util import initialize_model
 
 import numpyro_bridges as nb
 
+numpyro.set_host_device_count(3)  # before any array
+
 
 def show(line):
     rounded = {k: v if isinstance(v, (str, int)) else float(f"{v:.4g}") for k, v in line.items()}
@@ -291,8 +293,8 @@ def kunita(arguments):
     )  # fmt: skip
     start = time.perf_counter()
     mcmc.run(jr.key(7), data)
+    samples = jax.block_until_ready(mcmc.get_samples(group_by_chain=True))
     elapsed = time.perf_counter() - start
-    samples = mcmc.get_samples(group_by_chain=True)
     nodes = nb.to_arviz(mcmc)["posterior_nodes"]["tips"].to_numpy()
     inner = sorted(set(range(1, TERNARY.num_nodes)) - set(TERNARY.tips))
     quantities = {"draws": draws, "steps": num_steps, "compiling_included": True}
@@ -336,13 +338,12 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="few steps and draws: that all runs")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--draws", type=int, default=300, help="of each of 4 chains of function-space HMC")
+    parser.add_argument("--draws", type=int, default=150, help="of each of 4 chains of function-space HMC")
     parser.add_argument("--iterations", type=int, default=10_000, help="of each of 3 chains of hyperiax's notebook")
     parser.add_argument("--double", action="store_true", help="double precision; hyperiax's notebooks use single")
     parser.add_argument("--progress", action="store_true")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", arguments.double)
-    numpyro.set_host_device_count(3)
     for part in arguments.parts:
         PARTS[part](arguments)
 

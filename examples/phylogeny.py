@@ -49,6 +49,7 @@ def options(description, **defaults):
     parser.add_argument("--quick", action="store_true", help="16 points, few steps and draws, 2 chains")
     parser.add_argument("--points", type=int, default=32, help="landmarks, at equal steps of their number")
     parser.add_argument("--steps", type=int, default=6, help="on each branch")
+    parser.add_argument("--longest", type=float, help="instead, as many that none is longer, of a tree of height 1")
     parser.add_argument("--warmup", type=int, default=200)
     parser.add_argument("--samples", type=int, default=400)
     parser.add_argument("--fixed-root", action="store_true", help="the root is the mean, for certain")
@@ -69,7 +70,7 @@ def files(parser, required):
 def settings(arguments):
     """Those of `--quick` where it was asked for."""
     if arguments.quick:
-        arguments.points, arguments.steps = min(arguments.points, 16), 3
+        arguments.points, arguments.steps, arguments.longest = min(arguments.points, 16), 3, None
         arguments.warmup, arguments.samples = 30, 50
     return arguments
 
@@ -161,7 +162,8 @@ def law_of(data, arguments, amplitude, length_scale, within):
         match = jax.vmap(lambda points: nb.InexactMatch.from_point_sd(within, space, mask=points))(seen)
         own = ("match",)
     prior = {} if arguments.fixed_root else {"root_covariance": flow.covariance(0.0, data.start)}
-    return nb.DiffusionTree(flow, data.start, match, tree=data.tree, num_steps=arguments.steps, per_row=own, **prior)
+    steps = arguments.steps if arguments.longest is None else data.tree.num_steps(arguments.longest)
+    return nb.DiffusionTree(flow, data.start, match, tree=data.tree, num_steps=steps, per_row=own, **prior)
 
 
 def model_of(data, arguments, sd):

@@ -19,7 +19,7 @@ from ._guides import AbstractPlan
 from ._steering import GaussianSteering
 from ._step import GridNoise, GuidedStep, GuidedTerm
 
-_MAX_KEPT = 128
+_MAX_KEPT = 64
 """Largest n whose Cholesky factors, three n × n matrices a step, are kept for the reverse pass, not computed again."""
 
 
