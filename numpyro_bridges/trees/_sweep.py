@@ -473,8 +473,8 @@ class TreeProblem(eqx.Module):
             return jnp.concatenate([x[None], branch.anchor[None] + path]), log_weight
 
         def step(states, inputs):
-            of_branches, slot, parent_slot = inputs
-            path, log_weight = jax.vmap(inner_branch)(*of_branches, states[parent_slot])
+            (branch, plan, w, z), slot, parent_slot = inputs
+            path, log_weight = jax.vmap(inner_branch)(branch, plan, w, z, states[parent_slot])
             states = states.at[slot].set(path[:, -1], mode="drop", unique_indices=True)
             return states, (path, log_weight)
 

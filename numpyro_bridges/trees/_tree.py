@@ -338,15 +338,15 @@ class Tree(eqx.Module):
 
         The nodes between are not seen and have no names. Node i becomes node `sum(pieces[:i])`.
         """
-        pieces = np.array(positive_integers(pieces, "pieces", self.num_nodes - 1, "branches"))
-        place = np.concatenate([[0], np.cumsum(pieces)])
+        counts = np.array(positive_integers(pieces, "pieces", self.num_nodes - 1, "branches"))
+        place = np.concatenate([[0], np.cumsum(counts)])
         parents = np.arange(-1, place[-1])  # a piece begins where the one before it ends
         parents[1 + place[:-1]] = place[np.array(self.parents[1:], int)]  # or, the first, where the branch does
         names: list[str | None] = [None] * len(parents)
         for node, name in enumerate(self.names):
             names[place[node]] = name
-        branch = np.repeat(np.arange(len(pieces)), pieces)
-        lengths = (self.lengths / pieces.astype(self.lengths.dtype))[branch]
+        branch = np.repeat(np.arange(len(counts)), counts)
+        lengths = (self.lengths / counts.astype(self.lengths.dtype))[branch]
         return Tree(parents, lengths, names, [int(place[node]) for node in self.observed])
 
     def rows(
