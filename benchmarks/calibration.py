@@ -179,9 +179,10 @@ def plot(rows, path):
     for line, row in zip(axes, rows, strict=True):
         width = band(row["replicates"], row["num_ranks"])
         x = np.arange(1, row["num_ranks"]) / row["num_ranks"]
-        for axis in line[len(row["ranks"]) :]:
+        drawn, empty = np.split(line, [len(row["ranks"])])
+        for axis in empty:
             axis.set_axis_off()
-        for axis, (statistic, found) in zip(line, row["ranks"].items(), strict=False):
+        for axis, (statistic, found) in zip(drawn, row["ranks"].items(), strict=True):
             axis.fill_between(x, -width, width, color="0.85")
             axis.plot(x, difference(np.array(found), row["num_ranks"]), drawstyle="steps-post")
             axis.set_title(f"{row['kernel']}, {row['model']}\n{statistic}", fontsize=6)

@@ -10,7 +10,6 @@ standard error, temperatures, seconds with compilation; then the difference in u
 """
 
 import argparse
-import json
 import os
 import time
 from pathlib import Path
@@ -20,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 import jax.random as jr
 import numpy as np
+from trees import show
 
 import numpyro_bridges as nb
 
@@ -40,10 +40,6 @@ def simulated(num_steps: int):
     return law, data["tree_leaves"]
 
 
-def show(line):
-    print(json.dumps({key: float(f"{x:.4g}") if isinstance(x, float) else x for key, x in line.items()}), flush=True)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
@@ -60,7 +56,7 @@ def main():
         arguments.steps, arguments.particles, arguments.islands = 4, 16, 2
     case = simulated(arguments.steps)
     if case is None:
-        print(json.dumps({"skipped": "no kunita_cases/kunita_cases.npz: set NUMPYRO_BRIDGES_DATA"}))
+        show({"skipped": "no kunita_cases/kunita_cases.npz: set NUMPYRO_BRIDGES_DATA"})
         return
     law, data = case
     last = {}

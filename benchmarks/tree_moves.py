@@ -8,7 +8,6 @@ means of an ancestral coordinate, which must agree.
 """
 
 import argparse
-import json
 import os
 import time
 
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from numpyro.diagnostics import effective_sample_size
+from trees import show
 
 import numpyro_bridges as nb
 from numpyro_bridges.infer import PCN, PCNL, FunctionSpaceHMC
@@ -99,7 +99,7 @@ def main():
         line |= {"log_density_per_s": float(ess(log_density)[0]) / seconds}
         line |= {"mean": float(states[:, :, 1, 0, 0].mean()), "sd": float(states[:, :, 1, 0, 0].std())}
         line |= {"mean_log_density": float(log_density.mean()), "jax": jax.__version__}
-        print(json.dumps({k: float(f"{x:.4g}") if isinstance(x, float) else x for k, x in line.items()}), flush=True)
+        show(line)
 
 
 if __name__ == "__main__":

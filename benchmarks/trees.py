@@ -17,7 +17,6 @@ import numpy as np
 
 import numpyro_bridges as nb
 
-jax.config.update("jax_enable_x64", True)
 VARIANCE = 0.1
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
 
@@ -127,10 +126,12 @@ def flow(num_tips: int, repeats: int):
 
 
 def show(line):
-    print(json.dumps({key: float(f"{x:.3g}") if isinstance(x, float) else x for key, x in line.items()}))
+    rounded = {key: x if isinstance(x, (str, int)) else float(f"{x:.4g}") for key, x in line.items()}
+    print(json.dumps(rounded), flush=True)
 
 
 def main():
+    jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small trees only")
     quick = parser.parse_args().quick

@@ -713,10 +713,13 @@ def test_branch_lengths_have_priors():
 
 
 def test_priors_on_everything_in_both_precisions():
-    """Kernel, errors of each tip, lengths, root and guide, inside a model under jit: float32 within 0.02 of float64."""
+    """Kernel, errors of each tip, lengths, root and guide, inside a model under jit, branches with steps of their own.
+
+    float32 within 0.02 of float64.
+    """
     angles = 2 * np.pi * np.arange(6) / 6
     circle = np.stack([np.cos(angles), np.sin(angles)], 1)
-    size = LARGE.num_nodes - 1
+    size, counts = LARGE.num_nodes - 1, LARGE.num_steps(0.1)
     data = np.stack([(1 + 0.05 * i) * circle + 0.02 * i for i in range(7)])
 
     def everything(data):
@@ -727,17 +730,18 @@ def test_priors_on_everything_in_both_precisions():
         sd = numpyro.sample("sd", dist.LogNormal(-3.0, 0.3).expand([7]).to_event(1))
         rates = numpyro.sample("rates", dist.LogNormal(0.0, 0.3).expand([size]).to_event(1))
         start = numpyro.sample("start", dist.Normal(circle, 0.1).to_event(2))
-        guide = nb.RecedingGuide(numpyro.sample("end_weight", dist.Uniform(0.0, 0.5)))
+        correction = numpyro.sample("correction", dist.Uniform(0.0, 1.0))
+        guide = nb.GeodesicGuide(correction, numpyro.sample("end_weight", dist.Uniform(0.0, 0.5)))
         flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale), noise=nb.LandmarkNoise(1e-5))
         match = jax.vmap(lambda sd: nb.InexactMatch(sd**2, space=space))(sd)
         tree_law = nb.DiffusionTree(
-            flow, start, match, tree=tree.scaled(rates), num_steps=4, guide=guide, per_row=("match",)
+            flow, start, match, tree=tree.scaled(rates), num_steps=counts, guide=guide, per_row=("match",)
         )
         nb.sample("tips", tree_law, obs=data)
 
     values = {"amplitude": 0.4, "length_scale": 0.7, "sd": np.full(7, 0.05), "start": circle, "end_weight": 0.1}
-    values |= {"rates": np.linspace(0.8, 1.2, size)}
-    values |= {"tips_noise": np.random.default_rng(0).normal(size=(4 * size, 6, 2))}
+    values |= {"rates": np.linspace(0.8, 1.2, size), "correction": 0.6}
+    values |= {"tips_noise": np.random.default_rng(0).normal(size=(sum(counts), 6, 2))}
 
     def value_and_gradient(dtype):
         sites = {name: jnp.asarray(value, dtype) for name, value in values.items()}

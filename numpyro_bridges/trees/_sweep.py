@@ -30,7 +30,7 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._linalg import apply, full_precision, promote, varying_like
+from .._linalg import apply, full_precision, promote, rows, varying_like
 from .._types import State
 from ..conditioning import AbstractCondition, GaussianMessage, Observation, lift
 from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, default_guide, reach, retrace, retrace_reach, travel
@@ -435,10 +435,12 @@ class TreeProblem(eqx.Module):
             own, branch, slot, parent_slot, taken = inputs
             message, out = jax.vmap(joined)(jax.tree.map(lambda a, b: a + b[slot], own, kept), branch)
             is_read = jnp.zeros((schedule.num_slots + 1,), bool).at[slot].set(True)
-            kept = jax.tree.map(
-                lambda a, b: _where(is_read, 0.0, a).at[parent_slot].add(_where(taken, b, 0.0)), kept, message
-            )
-            return kept, out
+
+            def renewed(a, b):
+                a = jnp.where(rows(is_read, a), 0.0, a)
+                return a.at[parent_slot].add(jnp.where(rows(taken, b), b, 0.0))
+
+            return jax.tree.map(renewed, kept, message), out
 
         slots = np.array(schedule.slot, int), np.array(schedule.parent_slot, int)
         of_inner = _picked(own, schedule.inner), branches, *slots
@@ -529,9 +531,3 @@ def _picked_out(by_round, schedule: Schedule):
     places, taken = schedule.places()
     at = np.flatnonzero(taken)[np.argsort(places[taken])]
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[at], by_round)
-
-
-def _where(rows, there, elsewhere):
-    """By rows of arrays."""
-    array = there if jnp.ndim(there) else elsewhere
-    return jnp.where(rows.reshape(-1, *(1,) * (array.ndim - 1)), there, elsewhere)
