@@ -436,9 +436,9 @@ class TreeProblem(eqx.Module):
             message, out = jax.vmap(joined)(jax.tree.map(lambda a, b: a + b[slot], own, kept), branch)
             is_read = jnp.zeros((schedule.num_slots + 1,), bool).at[slot].set(True)
 
-            def renewed(a, b):
-                a = jnp.where(rows(is_read, a), 0.0, a)
-                return a.at[parent_slot].add(jnp.where(rows(taken, b), b, 0.0))
+            def renewed(a: Array, b: Array) -> Array:
+                unread = jnp.where(rows(is_read, a), 0.0, a)
+                return unread.at[parent_slot].add(jnp.where(rows(taken, b), b, 0.0))
 
             return jax.tree.map(renewed, kept, message), out
 
