@@ -1,21 +1,34 @@
 """What does the likelihood of a tree cost?
 
-    python benchmarks/trees.py [--quick]
+    python benchmarks/trees.py [--quick] [--parts linear flow species large]
 
-Linear processes of two traits on random binary trees, value, gradient and compile time, beside prunings in NumPy that
-take all nodes of one height at once; then Kunita flows of 16 landmarks, 20 steps a branch, value and compile time. One
-JSON line each, double precision, run times the minimum of several.
+`linear`: processes of two traits on random binary trees, value, gradient and compile time, beside prunings in NumPy
+that take all nodes of one height at once. `flow`: Kunita flows of 16 landmarks, 20 steps a branch. `species`: wings of
+30 species of butterflies at 20 points, 6 steps a branch, then steps no longer than the longest of those, then half as
+long, with the spread of the log weight; they are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or
+`../shared/data`. `large`, if asked for: 425 tips of 118 landmarks, 25 steps a branch, minutes.
+
+One JSON line each, double precision, run times the minimum of several, memory the peak of the process.
 """
 
 import argparse
 import json
+import os
+import resource
+import sys
 import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
 
 import numpyro_bridges as nb
+
+FOLDER = Path(os.environ.get("NUMPYRO_BRIDGES_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 VARIANCE = 0.1
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
@@ -125,6 +138,71 @@ def flow(num_tips: int, repeats: int):
     show(line | {"value_ms": 1e3 * seconds(lambda: value(kernel, noise), repeats)})
 
 
+def species(repeats: int, num_draws: int):
+    file = FOLDER / "morpho" / "forewing_means_20.csv"
+    if not file.is_file():
+        show({"process": "species", "skipped": f"no {file}: set NUMPYRO_BRIDGES_DATA"})
+        return
+    sys.path.append(str(Path(__file__).parents[1] / "examples"))
+    from phylogeny import prepare
+
+    specimens = nb.io.read_csv(file)
+    shapes = np.stack([specimen.landmarks for specimen in specimens])
+    names = [specimen.id for specimen in specimens]
+    data = prepare(shapes, names, nb.Tree.from_newick(file.parent / "tree.nwk"))
+    space, tree, amplitude = nb.Landmarks(20, 2), data.tree, np.array(0.0982)
+    longest = float(max(tree.lengths)) / 6
+    for steps, num_steps in (
+        ("6 a branch", 6),
+        (f"at most {longest:.3f}", tree.num_steps(longest)),
+        (f"at most {longest / 2:.3f}", tree.num_steps(longest / 2)),
+    ):
+
+        def law(amplitude, num_steps=num_steps):
+            flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, 0.1836))
+            match = nb.InexactMatch.from_point_sd(0.005, space)
+            return nb.DiffusionTree(flow, data.start, match, tree=tree, num_steps=num_steps)
+
+        def log_weight(amplitude, noise, law=law):
+            return law(amplitude).given(noise).log_prob(data.rows)
+
+        noise = jr.normal(jr.key(0), (num_draws, *law(amplitude).noise_prior().shape()))
+        value, compile_s = compiled(log_weight, amplitude, noise[0])
+        gradient, gradient_compile_s = compiled(jax.value_and_grad(log_weight, (0, 1)), amplitude, noise[0])
+        found = np.array([value(amplitude, one) for one in noise])
+        line = {"process": "Kunita, 30 species, 20 landmarks", "steps": steps, "rows": noise.shape[1]}
+        line |= {"mean": found.mean(), "sd": found.std(), "compile_s": compile_s}
+        line["value_ms"] = 1e3 * seconds(lambda run=value, z=noise[0]: run(amplitude, z), repeats)
+        line["gradient_compile_s"] = gradient_compile_s
+        show(line | {"gradient_ms": 1e3 * seconds(lambda run=gradient, z=noise[0]: run(amplitude, z), repeats)})
+
+
+def large(quick: bool):
+    num_tips, num_points, num_steps = (16, 20, 4) if quick else (425, 118, 25)
+    tree, angles = random_tree(num_tips), 2 * np.pi * np.arange(num_points) / num_points
+    tree = tree.scaled(1 / tree.height)
+    circle = np.stack([np.cos(angles), np.sin(angles)], 1)
+    space = nb.Landmarks(num_points, 2)
+
+    def law(kernel):
+        match = nb.InexactMatch.from_point_sd(0.01, space)
+        return nb.DiffusionTree(nb.KunitaFlow(space, kernel), circle, match, tree=tree, num_steps=num_steps)
+
+    kernel = nb.GaussianKernel(0.1, 0.3)
+    data = jax.jit(lambda key: law(kernel).sample(key))(jr.key(0))
+    noise = jr.normal(jr.key(1), law(kernel).noise_prior().shape())
+
+    def log_weight(kernel, noise):
+        return law(kernel).given(noise).log_prob(data)
+
+    line = {"process": f"Kunita, {num_points} landmarks, {num_steps} steps", "tips": num_tips}
+    for name, f in (("value", log_weight), ("gradient", jax.value_and_grad(log_weight, (0, 1)))):
+        program, line[f"{name}_compile_s"] = compiled(f, kernel, noise)
+        line[f"{name}_s"] = seconds(lambda run=program: run(kernel, noise), 1)
+        line[f"{name}_peak_GiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    show(line)
+
+
 def show(line):
     rounded = {key: x if isinstance(x, (str, int)) else float(f"{x:.4g}") for key, x in line.items()}
     print(json.dumps(rounded), flush=True)
@@ -134,11 +212,20 @@ def main():
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small trees only")
-    quick = parser.parse_args().quick
-    for num_tips in (100,) if quick else (100, 1000):
-        linear(num_tips, 5 if quick else 20)
-    for num_tips in (16,) if quick else (16, 64, 256, 1024):
-        flow(num_tips, 3)
+    parts = ("linear", "flow", "species", "large")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=parts[:3])
+    arguments = parser.parse_args()
+    quick = arguments.quick
+    if "linear" in arguments.parts:
+        for num_tips in (100,) if quick else (100, 1000):
+            linear(num_tips, 5 if quick else 20)
+    if "flow" in arguments.parts:
+        for num_tips in (16,) if quick else (16, 64, 256, 1024):
+            flow(num_tips, 3)
+    if "species" in arguments.parts:
+        species(5 if quick else 20, 5 if quick else 200)
+    if "large" in arguments.parts:
+        large(quick)
 
 
 if __name__ == "__main__":
