@@ -43,6 +43,7 @@ from .sdes import (
     SDE as SDE,
     AbstractSDE as AbstractSDE,
     BrownianMotion as BrownianMotion,
+    ControlNoise as ControlNoise,
     GridNoise as GridNoise,
     KunitaFlow as KunitaFlow,
     LandmarkNoise as LandmarkNoise,

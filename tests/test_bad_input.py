@@ -221,6 +221,7 @@ def table() -> dict[str, Row]:
             noise=("noise or name", nb.LandmarkNoise()),
         ),
         "LandmarkNoise": row(nb.LandmarkNoise, jitter=("number?", 1e-6)),
+        "ControlNoise": row(nb.ControlNoise, num_points="count?", points="free", jitter="number?"),
         "SpectralNoise": row(
             nb.SpectralNoise,
             num_modes=("count", 2),

@@ -123,14 +123,14 @@ SDES = [
     (
         "noise-name",
         lambda: flow(noise="fourier"),
-        "`noise` must be one of .*'grid', 'landmark', 'spectral'.*got 'fourier'",
+        "`noise` must be one of .*'control', 'grid', 'landmark', 'spectral'.*got 'fourier'",
     ),
     ("noise-number", lambda: flow(noise=3), "`noise` must be one of .* or a noise object; got 3"),
-    ("noise-of-a-basis", lambda: flow(space=BASIS), '`noise="landmark"`.*`FourierBasis`.*Use `noise="spectral"` or'),
+    ("noise-of-a-basis", lambda: flow(space=BASIS), '`landmark` noise.*`FourierBasis`.*Use `noise="spectral"` or'),
     (
         "noise-object-of-a-basis",
         lambda: flow(space=BASIS, noise=nb.LandmarkNoise()),
-        '`noise="landmark"`.*`FourierBasis`',
+        "`LandmarkNoise` noise.*`FourierBasis`",
     ),
     (
         "grid-without-kernel",

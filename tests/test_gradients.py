@@ -97,6 +97,11 @@ def jittered(p):
     return nb.KunitaFlow(space, covariance=nb.GaussianKernel(p["amplitude"], 0.8), noise=noise)
 
 
+def controls(p):
+    kernel = nb.GaussianKernel(p["amplitude"], p["length_scale"])
+    return nb.KunitaFlow(nb.Landmarks(3, 2), kernel, noise=nb.ControlNoise(points=[1]))
+
+
 def spectral(p):
     kernel = nb.GaussianKernel(p["amplitude"], p["length_scale"])
     return nb.KunitaFlow(nb.Landmarks(3, 1), kernel, noise=nb.SpectralNoise(20, p["period"]))
@@ -179,6 +184,7 @@ def brownian(p):
 DIAGONAL = {"drift": np.array([0.0, -1.0]), "diffusion": np.array([0.7, 0.0])}
 OPPOSITE = {"drift": np.array([1.0, -1.0]), "diffusion": MATRIX}
 CUTS = {"cuts": np.array([0.1, 0.9])}
+FAR = {"length_scale": 14.0, "amplitude": 0.05}
 WIDE = {"length_scale": 0.9, "period": 9.5}
 CURVE = {"x0": 0.4 * TRIANGLE[:, :1], "observed": 0.4 * TRIANGLE[:, 1:]}
 BOX = {"length_scale": 0.5, "lower": -4.0}
@@ -205,6 +211,7 @@ CASES = {
     "geodesic": (flow, inexact, geodesic, SHAPES | {"length_scale": 0.9, "end_weight": 0.1, "correction": 0.75}),
     "geodesic, straight": (flow, inexact, geodesic, SHAPES | STILL | {"end_weight": 0.0, "correction": 1.0}),
     "flow": (flow, inexact, receding, SHAPES | {"length_scale": 0.9, "end_weight": 0.0}),
+    "controls": (controls, inexact, geodesic, SHAPES | FAR | {"end_weight": 0.0, "correction": 0.75}),
     "no jitter": (jittered, inexact, receding, SHAPES | JITTER | {"end_weight": 1.0}),
     "sum of kernels": (sum_of_kernels, inexact, receding, SHAPES | MIXED),
     "quadrature": (quadrature, inexact, no_guide, SHAPES | CURVE | CELLS | {"length_scale": 0.8}),

@@ -169,6 +169,8 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
         lambda flow: factor_of(flow) + jnp.sum(flow.space.weights),
     ),
     "LandmarkNoise": (nb.LandmarkNoise, {"jitter": times(1e-3)}, driven_by),
+    "ControlNoise": (nb.ControlNoise, {"num_points": 2, "points": None, "jitter": times(1e-3)}, driven_by),
+    "ControlNoise, points": (nb.ControlNoise, {"points": [2, 0], "jitter": times(1e-3)}, driven_by),
     "SpectralNoise": (nb.SpectralNoise, {"num_modes": 2, "period": times(4.0), "diameter": times(2.0)}, driven_by),
     "SpectralNoise, period": (nb.SpectralNoise, {"num_modes": 2, "diameter": times(2.0)}, driven_by),
     "GridNoise": (nb.GridNoise, {"lower": times(-1.5), "upper": times([1.2, 1.5]), "num_cells": 3}, driven_by),

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._linalg import apply, varying_like
+from .._linalg import apply, compose, varying_like
 from .._types import Noise, State
 from ..conditioning import Observation
 from ..sdes import AbstractSDE, Transition
-from ._guides import AbstractPlan
+from ._few_noises import Errors, LowRank, NoiseSteering
+from ._guides import AbstractPlan, is_low_rank, per_time, steered
 from ._steering import GaussianSteering
 from ._step import GridNoise, GuidedStep, GuidedTerm
 
@@ -112,7 +113,7 @@ def retrace_reach(
     free, without_effect = _free_noise(sde, path[-2:], key_end)
     transition, steering = _last_step(sde, seen, ts, x, observed)
     last = steering.inverse(_driving_noise(transition, end, free))
-    if seen.exact:
+    if isinstance(steering, GaussianSteering) and seen.exact:
         last = last + steering.without_effect(without_effect)
     return jnp.concatenate([z, last[None]])
 
@@ -127,11 +128,16 @@ def _ends(plan: AbstractPlan):
     return jax.tree.map(lambda a: a[1:], plan.steps)
 
 
-def _last_step(sde, seen, ts, x, observed) -> tuple[Transition, GaussianSteering]:
+def _last_step(sde, seen, ts, x, observed) -> tuple[Transition, GaussianSteering | NoiseSteering]:
     transition = sde.transition(ts[-2], ts[-1], x)
     covariance = None if seen.exact else seen.covariance
+    dt = ts[-1] - ts[-2]
+    if is_low_rank(transition.factor, seen):
+        sigma, _ = per_time(transition, dt)
+        none = jnp.zeros((), x.dtype)
+        covariance = LowRank(Errors.of(seen.covariance), none, compose(seen.operator, sigma), none)
     shift = jnp.zeros_like(observed)
-    return transition, GaussianSteering(transition, seen.operator, shift, covariance, observed, seen.exact)
+    return transition, steered(transition, dt, seen.operator, shift, covariance, observed, seen.exact)
 
 
 def _driving_noise(transition: Transition, x: State, free: Noise) -> Noise:

@@ -14,6 +14,7 @@ and the target is moved by a part of it. What is seen of a state beyond the end,
 at a later time: there the path ends.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -23,7 +24,8 @@ from .._checks import as_float, require
 from .._linalg import apply, cholesky, filled, solve_lower, transpose, without_variance
 from .._types import State, Structured
 from ..sdes import AbstractSDE
-from ._guides import AbstractGuide, AbstractPlan, FrozenGuide, RecedingGuide, RecedingPlan
+from ._few_noises import LowRank
+from ._guides import AbstractGuide, AbstractPlan, FrozenGuide, RecedingGuide, RecedingPlan, per_time
 
 
 class GeodesicGuide(AbstractGuide):
@@ -76,8 +78,7 @@ class _GeodesicPlan(AbstractPlan):
 
     def steer(self, step, transition, dt, x, observed):
         here, before = step
-        a = transition.covariance / jnp.where(dt == 0, 1.0, dt)
-        miss, _ = self._miss(before, a, x, observed)
+        miss, _ = self._miss(before, per_time(transition, dt), x, observed)
         return self.receding.steer(here[0], transition, dt, x, observed + self.correction_part * miss)
 
     def message(self, step, sde, t, x, observed):
@@ -85,38 +86,42 @@ class _GeodesicPlan(AbstractPlan):
 
     def correction(self, step, x):
         here, _ = step
-        a = self.sde.covariance(here[1], x)
-        operator, shift, _ = self.receding.forecast(here[0], a)
-        miss, solve = self._miss(here, a, x, jnp.zeros_like(shift))
+        noise = self.sde.noise(here[1], x)
+        operator, shift, _ = self.receding.forecast(here[0], noise)
+        miss, solve = self._miss(here, noise, x, jnp.zeros_like(shift))
         return apply(transpose(operator), solve(self.correction_part * miss))
 
-    def _miss(self, entry, a, x, observed):
+    def _miss(self, entry, noise, x, observed):
         """By how much the path of the receding momentum misses what is observed, and S⁻¹."""
         step, t, left = entry
-        operator, shift, covariance = self.receding.forecast(step, a)
-        factor = cholesky(filled(covariance, without_variance(covariance)))
-
-        def solve(r):
-            return solve_lower(factor, solve_lower(factor, r), transposed=True)
-
+        operator, shift, covariance = self.receding.forecast(step, noise)
+        solve = _solver(covariance)
         r = observed - shift - apply(operator, x)
         momentum = solve(r)
 
         def hamiltonian(x, p):
-            return jnp.sum(p * self.sde.drift(t, x)) + 0.5 * jnp.sum(p * apply(self.sde.covariance(t, x), p))
+            return jnp.sum(p * self.sde.drift(t, x)) + self.sde.energy(t, x, p)
 
         slopes = jax.grad(hamiltonian, (0, 1))
         p = apply(transpose(operator), momentum)
         dp, dx = slopes(x, p)
         dp, dx = slopes(x + 0.5 * left * dx, p - 0.5 * left * dp)
         x, p = x + left * dx, p - left * dp
-        L, noise = self.receding.operator, self.receding.noise
+        L, error = self.receding.seen.operator, self.receding.seen.covariance
         if L.ndim < 2:
             momentum = apply(jnp.where(L == 0, 0.0, 1 / jnp.where(L == 0, 1.0, L)), p)
-        miss = observed - apply(L, x) - apply(noise, momentum)
+        miss = observed - apply(L, x) - apply(error, momentum)
         to_go = jnp.sum(r * solve(r))
         excess = jnp.where(to_go > 0, jnp.sum(miss * solve(miss)) / jnp.where(to_go > 0, to_go, 1.0), 0.0)
         return miss / (1 + (0.5 * excess) ** 2), solve
+
+
+def _solver(covariance: Structured | LowRank) -> Callable[[State], State]:
+    """Its inverse."""
+    if isinstance(covariance, LowRank):
+        return covariance.solve
+    factor = cholesky(filled(covariance, without_variance(covariance)))
+    return lambda r: solve_lower(factor, solve_lower(factor, r), transposed=True)
 
 
 def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:

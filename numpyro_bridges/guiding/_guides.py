@@ -11,17 +11,18 @@ the forecast of v from x_k is N(Λ_k x_k + s_k, M_k),
 """
 
 import abc
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._checks import as_float, require, require_instance
-from .._linalg import add, apply, compose, congruence, promote, semidefinite_cholesky, varying_like
+from .._checks import as_float, known, require, require_instance
+from .._linalg import add, apply, compose, congruence, promote, safe_sqrt, semidefinite_cholesky, varying_like
 from .._types import RealScalar, State, Structured
 from ..conditioning import GaussianMessage, Observation
 from ..sdes import AbstractSDE, AffineStep, BrownianMotion, Displaced, LinearSDE, Transition
+from ._few_noises import Errors, LowRank, NoiseSteering, are_few
 from ._steering import AbstractSteering, DriftSteering, GaussianSteering
 
 _MAX_DENSE = 16
@@ -156,26 +157,37 @@ class RecedingPlan(AbstractPlan):
     """Flow, shift and accumulated time, of which the forecast is made with the covariance at the current state."""
 
     steps: tuple[Structured, State, Structured]
-    operator: Structured
-    noise: Structured
-    end_covariance: Structured
-    end_weight: Structured
-    exact: bool = eqx.field(static=True)
+    seen: Observation
+    end: "_End | None"
+    """What is bridged by the covariance of the end."""
+    few: Errors | None
+    """Errors of what is observed, for few noises."""
 
-    def forecast(self, step, a: Structured) -> tuple[Structured, State, Structured]:
-        """Operator, shift and covariance of what is observed, where the covariance of the process is a."""
+    def forecast(
+        self, step, here: tuple[Structured, Structured]
+    ) -> tuple[Structured, State, Structured | LowRank]:
+        """Operator, shift and covariance of what is observed, where σ and a of the process are these."""
         flow, shift, kappa = step
-        a = (1 - self.end_weight) * a + self.end_weight * self.end_covariance
-        covariance = add(self.noise, congruence(self.operator, _accumulated(kappa, a)))
-        return compose(self.operator, flow), shift, covariance
+        sigma, a = here
+        L, w = self.seen.operator, jnp.zeros(()) if self.end is None else self.end.weight
+        if self.few is not None:
+            return compose(L, flow), shift, LowRank(self.few, w * kappa, compose(L, sigma), (1 - w) * kappa)
+        if self.end is not None:
+            a = (1 - w) * a + w * self.end.covariance
+        return compose(L, flow), shift, add(self.seen.covariance, congruence(L, _accumulated(kappa, a)))
 
     def steer(self, step, transition, dt, x, observed):
-        a = transition.covariance / jnp.where(dt == 0, 1.0, dt)  # a branch of a tree may have no length
-        return GaussianSteering(transition, *self.forecast(step, a), observed, self.exact)
+        return steered(transition, dt, *self.forecast(step, per_time(transition, dt)), observed, self.seen.exact)
 
     def message(self, step, sde, t, x, observed):
-        operator, shift, covariance = self.forecast(step, sde.covariance(t, x))
-        return GaussianMessage(operator, shift, semidefinite_cholesky(covariance), observed, jnp.zeros((), x.dtype))
+        operator, shift, covariance = self.forecast(step, sde.noise(t, x))
+        factor = semidefinite_cholesky(covariance.dense() if isinstance(covariance, LowRank) else covariance)
+        return GaussianMessage(operator, shift, factor, observed, jnp.zeros((), x.dtype))
+
+
+class _End(NamedTuple):
+    weight: Structured
+    covariance: Structured
 
 
 class RecedingGuide(AbstractGuide):
@@ -188,14 +200,17 @@ class RecedingGuide(AbstractGuide):
     harms on hard ones.
     """
 
-    end_weight: Structured
+    end_weight: Structured | None
+    """`None` for a weight of 0 that is known."""
 
     def __init__(self, end_weight=0.0):
-        self.end_weight = as_float(end_weight, "end_weight")
+        value = known(end_weight, "end_weight")
+        weight = as_float(end_weight, "end_weight")
         require(
-            (self.end_weight.ndim == 0) and (0 <= self.end_weight) & (self.end_weight <= 1),
+            (weight.ndim == 0) and (0 <= weight) & (weight <= 1),
             f"`end_weight` must be a number from 0 to 1; got {end_weight}.",
         )
+        self.end_weight = None if value is not None and value == 0 else weight
 
     @property
     def moves(self):
@@ -231,8 +246,11 @@ class RecedingGuide(AbstractGuide):
         start = (one, jnp.zeros_like(apply(seen.operator, reference)), beyond)
         start = varying_like(start, seen, operator, shift, ts)
         _, planned = jax.lax.scan(back, start, (operator, shift, jnp.diff(ts)), reverse=True)
-        a = sde.covariance(ts[-1], reference)
-        return RecedingPlan(planned, seen.operator, seen.covariance, a, self.end_weight, seen.exact)
+        sigma, a = sde.noise(ts[-1], reference)
+        w, errors = self.end_weight, None
+        if is_low_rank(sigma, seen) and ndim == 0:
+            errors = Errors.of(seen.covariance, None if w is None else compose(seen.operator, sigma))
+        return RecedingPlan(planned, seen, None if w is None else _End(w, a), errors)
 
 
 class DriftGuide(AbstractGuide):
@@ -277,6 +295,34 @@ class _DriftPlan(AbstractPlan):
 
     def correction(self, step, x):
         return self.wrapped.correction(step, x)
+
+
+def is_low_rank(sigma: Structured, seen: Observation) -> bool:
+    """Whether fewer noises drive what is seen than it has values, whose errors are independent."""
+    num_values = len(seen.operator if seen.operator.ndim else sigma) if sigma.ndim else 0
+    return seen.factor is not None and seen.factor.ndim < 2 and are_few(sigma, num_values)
+
+
+def per_time(transition: Transition, dt: RealScalar) -> tuple[Structured, Structured]:
+    """σ and a of a step."""
+    dt = jnp.where(dt == 0, 1.0, dt)  # a branch of a tree may have no length
+    return transition.factor / jnp.sqrt(dt), transition.covariance / dt
+
+
+def steered(
+    transition: Transition,
+    dt: RealScalar,
+    operator: Structured,
+    shift: State,
+    covariance: Structured | LowRank | None,
+    observed: State,
+    may_be_empty: bool = False,
+) -> GaussianSteering | NoiseSteering:
+    """A step whose end is seen as N(operator x' + shift, covariance), in the space of what is smaller."""
+    if not isinstance(covariance, LowRank):
+        return GaussianSteering(transition, operator, shift, covariance, observed, may_be_empty)
+    r = observed - shift - apply(operator, transition.mean)
+    return NoiseSteering(covariance, safe_sqrt(dt), r)
 
 
 def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, State, Structured]:

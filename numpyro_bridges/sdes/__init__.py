@@ -12,6 +12,7 @@ from ._kunita import KunitaFlow as KunitaFlow
 from ._linear import BrownianMotion as BrownianMotion, LinearSDE as LinearSDE, as_covariance as as_covariance
 from ._noise import (
     AbstractNoise as AbstractNoise,
+    ControlNoise as ControlNoise,
     GridNoise as GridNoise,
     LandmarkNoise as LandmarkNoise,
     SpectralNoise as SpectralNoise,

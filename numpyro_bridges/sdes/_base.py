@@ -103,6 +103,13 @@ class AbstractSDE(eqx.Module):
         """a(t, x) = σσᵀ: `()`, `(n,)` or `(n, n)`."""
         return self.noise(t, x)[1]
 
+    def energy(self, t: RealScalar, x: State, p: State) -> Float[Array, ""]:
+        """½ Σ pᵀ a(t, x) p over columns, without a where few noises make it."""
+        sigma, a = self.noise(t, x)
+        if sigma.ndim == 2 and sigma.shape[1] < x.shape[0]:
+            return 0.5 * jnp.sum(apply(sigma.T, p) ** 2)
+        return 0.5 * jnp.sum(p * apply(a, p))
+
     def covariance_divergence(self, t: RealScalar, x: State) -> State:
         """(div a)_i = Σ_j ∂a_ij/∂x_j, shaped like x."""
         if self.has_constant_covariance(x):
@@ -236,6 +243,9 @@ class Displaced(AbstractSDE):
 
     def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
         return self.sde.noise(self.clock + t, self.origin + x)
+
+    def energy(self, t: RealScalar, x: State, p: State) -> Float[Array, ""]:
+        return self.sde.energy(self.clock + t, self.origin + x, p)
 
     def has_constant_covariance(self, x: State) -> bool:
         return self.sde.has_constant_covariance(self.origin + x)

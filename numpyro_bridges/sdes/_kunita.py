@@ -20,10 +20,13 @@ from .._types import RealScalar, State, Structured
 from ..kernels import AbstractKernel
 from ..spaces import AbstractSpace, Landmarks
 from ._base import AbstractSDE, at_any_time
-from ._noise import NOISES, AbstractNoise, LandmarkNoise
+from ._noise import NOISES, AbstractNoise, ControlNoise, LandmarkNoise
 
 _COINCIDE = 1e-6
 """Distance of two landmarks, relative to the size of the shape, at which they are one."""
+
+_MANY = 64
+"""Number of landmarks above which noise is that of controls, if the user does not say."""
 
 _SEEN, _REFUSED = 0.01, 0.1
 """Wrong parts of a(x, x) from which on there is a warning, and an error."""
@@ -38,8 +41,9 @@ class KunitaFlow(AbstractSDE):
       points and projected.
     - `kernel`: k, which is convolved with itself; or
     - `covariance`: the covariance function a itself (some of the literature writes its kernel there).
-    - `noise`: `"landmark"` (for landmarks only), `"spectral"`, `"grid"`, or a `LandmarkNoise`,
-      `SpectralNoise`, `GridNoise` with its own settings.
+    - `noise`: `"landmark"`, `"control"` (both for landmarks), `"spectral"`, `"grid"`, or a `LandmarkNoise`,
+      `ControlNoise`, `SpectralNoise`, `GridNoise` with its own settings. By default `"landmark"`, which is exact, and
+      `"control"` for more than 64 landmarks, which costs as much as they are many.
     """
 
     space: AbstractSpace
@@ -53,7 +57,7 @@ class KunitaFlow(AbstractSDE):
         kernel: AbstractKernel | None = None,
         *,
         covariance: AbstractKernel | None = None,
-        noise: str | AbstractNoise = "landmark",
+        noise: str | AbstractNoise | None = None,
     ):
         require(
             (kernel is None) != (covariance is None),
@@ -64,6 +68,8 @@ class KunitaFlow(AbstractSDE):
         for name, k in (("kernel", kernel), ("covariance", covariance)):
             if k is not None:
                 require_instance(k, AbstractKernel, name, "a kernel, such as `GaussianKernel(amplitude, length_scale)`")
+        if noise is None:
+            noise = "control" if isinstance(space, Landmarks) and space.size > _MANY else "landmark"
         if isinstance(noise, str):
             require(noise in NOISES, f"`noise` must be one of {sorted(NOISES)} or a noise object; got {noise!r}.")
             noise_field: AbstractNoise = NOISES[noise]()
@@ -71,9 +77,10 @@ class KunitaFlow(AbstractSDE):
             require_instance(noise, AbstractNoise, "noise", f"one of {sorted(NOISES)} or a noise object")
             noise_field = noise
         require(
-            isinstance(space, Landmarks) or not isinstance(noise_field, LandmarkNoise),
-            '`noise="landmark"` is attached to landmarks, and the coefficients of a `FourierBasis` are none: '
-            'their covariance has no points to be factored at. Use `noise="spectral"` or `noise="grid"`.',
+            isinstance(space, Landmarks) or noise_field.fixed_in_space,
+            f"`{noise if isinstance(noise, str) else type(noise).__name__}` noise is attached to landmarks, and the "
+            "coefficients of a `FourierBasis` are none: their covariance has no points to be factored at. Use "
+            '`noise="spectral"` or `noise="grid"`.',
         )
         if kernel is not None:
             covariance = kernel.convolved(space.dim)
@@ -82,6 +89,10 @@ class KunitaFlow(AbstractSDE):
         self.kernel = kernel
         self.covariance_kernel = covariance
         self.noise_field = noise_field
+
+    def closed(self, t: RealScalar, x: State) -> "KunitaFlow":
+        chosen = self.noise_field.chosen(self.space.to_points(x))
+        return eqx.tree_at(lambda flow: flow.noise_field, self, chosen)
 
     def drift(self, t: RealScalar, x: State) -> State:
         return jnp.zeros_like(x)
@@ -93,14 +104,19 @@ class KunitaFlow(AbstractSDE):
         sigma = self.space.from_points(sigma)
         return sigma, sigma @ sigma.T
 
+    def energy(self, t: RealScalar, x: State, p: State) -> Float[Array, ""]:
+        if isinstance(self.space, Landmarks):
+            return self.noise_field.energy(self.kernel, self.covariance_kernel, x, p)
+        return super().energy(t, x, p)
+
     def covariance_divergence(self, t: RealScalar, x: State) -> State:
-        if not isinstance(self.space, Landmarks):
+        if isinstance(self.noise_field, ControlNoise) or not isinstance(self.space, Landmarks):
             return super().covariance_divergence(t, x)
         slope = jax.grad(self.covariance_kernel, argnums=1)
         return jnp.sum(jax.vmap(lambda p: jax.vmap(lambda q: slope(p, q))(x))(x), axis=1)
 
     def covariance_double_divergence(self, t: RealScalar, x: State) -> Float[Array, ""]:
-        if not isinstance(self.space, Landmarks):
+        if isinstance(self.noise_field, ControlNoise) or not isinstance(self.space, Landmarks):
             return super().covariance_double_divergence(t, x)
 
         def mixed(p, q):
@@ -123,18 +139,20 @@ class KunitaFlow(AbstractSDE):
         return self.noise_field.fixed_in_space
 
     def noise_error(self, x: Float[Array, "... n dim"] | None = None) -> dict:
-        """What spectral or grid noise gets wrong, relative to a(x, x); empty for landmark noise.
+        """What noise that is not exact gets wrong, relative to a(x, x); empty for landmark noise.
 
         **Arguments:** `x`: a state, or a path `(K + 1, n, dim)`, of which the worst state counts. Without it spectral
         noise answers for shapes of its `diameter`.
 
-        **Returns:** a dictionary. Of spectral noise, `tail`, the variance that is missing at each point for want of
-        modes, and `wrap_around`, the covariance of the ends of the shape through the periodic image. Of grid noise at
-        x, `edge`, the variance that is lost where points are too near the edge of the box, and `quadrature`, the whole
-        error of a(x, x). A `UserWarning` says which of them are above 1 %.
+        **Returns:** a dictionary. Of control noise at x, `missing`, the variance that the controls, those of a bridge
+        from the first state if they are not given, do not tell at the worst landmark. Of spectral noise, `tail`, the
+        variance that is missing at each point for want of modes, and `wrap_around`, the covariance of the ends of the
+        shape through the periodic image. Of grid noise at x, `edge`, the variance that is lost where points are too
+        near the edge of the box, and `quadrature`, the whole error of a(x, x). A `UserWarning` says which of them are
+        above 1 %.
 
-        A start with 10 % or more of `wrap_around` or `edge` is refused. A path that comes to half of a(x, x), at the
-        edge of the box, is NaN from there on, and so is its weight; what lies between is seen here only.
+        A start with 10 % or more of `missing`, `wrap_around` or `edge` is refused. A path that comes to half of
+        a(x, x), at the edge of a box, is NaN from there on, and so is its weight; what lies between is seen here only.
         """
         points = None
         if x is not None:
@@ -152,9 +170,10 @@ class KunitaFlow(AbstractSDE):
         return error
 
     def start(self, x: State) -> State:
-        if concrete(x) is not None or not isinstance(self.noise_field, LandmarkNoise) or len(x) == 1:
+        index = self.noise_field.factored_at(x)
+        if concrete(x) is not None or index is None or len(index) == 1:
             return x
-        y = lax.stop_gradient(x)
+        y = lax.stop_gradient(x)[index]
         apart = jnp.min(_distances(jnp, y)) > _COINCIDE * (jnp.max(y) - jnp.min(y))
         return jnp.where(apart, x, jnp.nan)
 
@@ -162,25 +181,26 @@ class KunitaFlow(AbstractSDE):
         shape = (self.space.size, self.space.dim)
         require(x.shape == shape, f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}.")
         at_any_time(self.noise, x)
-        value = concrete(x)
-        if value is not None and isinstance(self.noise_field, LandmarkNoise) and len(value) > 1:
-            gap = _distances(np, value)
+        index, value = self.noise_field.factored_at(x), concrete(x)
+        index = None if index is None else concrete(index)
+        if value is not None and index is not None and len(index) > 1:
+            gap = _distances(np, value[index])
             i, j = np.unravel_index(np.argmin(gap), gap.shape)
             require(
                 gap[i, j] > _COINCIDE * np.ptp(value),
-                f"`x0` must have distinct landmarks; {min(i, j)} and {max(i, j)} coincide (distance {gap[i, j]:.1e}): "
-                "they move as one point and their covariance is singular. Remove one of them, or use "
-                '`noise="spectral"`.',
+                f"`x0` must have distinct landmarks; {index[min(i, j)]} and {index[max(i, j)]} coincide (distance "
+                f"{gap[i, j]:.1e}): they move as one point and their covariance is singular. Remove one of them, or "
+                'use `noise="spectral"`.',
             )
         self._check_room("x0", x, refuse=True)
 
     def check_end(self, find: Callable[[], State]) -> None:
-        if self.noise_field.fixed_in_space and _known(self):
+        if not isinstance(self.noise_field, LandmarkNoise) and _known(self):
             self._check_room("condition", find(), refuse=False)
 
     def _check_room(self, name: str, x: State, refuse: bool) -> None:
         """Where it can be known, says whether the noise has room for a state."""
-        if not self.noise_field.fixed_in_space or not _known((self, x)):
+        if isinstance(self.noise_field, LandmarkNoise) or not _known((self, x)):
             return
         with jax.ensure_compile_time_eval():  # inside a traced program too
             lost = float(_misfit(self, x))

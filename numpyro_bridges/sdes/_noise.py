@@ -1,11 +1,12 @@
 """Representations of the noise of a Kunita flow: factors σ(x) of the covariance of a Gaussian field at given points.
 
 The field has covariance a(x, x'), the convolution of the flow's kernel with itself. Each representation gives σ with
-σσᵀ = a at the points: exactly (landmark), up to a truncated tail and a wrap-around (spectral), up to a quadrature
-error (grid).
+σσᵀ = a at the points: exactly (landmark), up to what some of the points do not tell of the others (control), up to a
+truncated tail and a wrap-around (spectral), up to a quadrature error (grid).
 """
 
 import abc
+import bisect
 import itertools
 from collections.abc import Callable
 
@@ -14,14 +15,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._checks import as_float, positive_integer, require, require_finite, require_positive
-from .._linalg import add, cholesky, safe_sqrt
+from .._checks import (
+    as_float,
+    concrete,
+    known,
+    known_float,
+    known_number,
+    positive_integer,
+    require,
+    require_finite,
+    require_positive,
+    words,
+)
+from .._linalg import add, cholesky, safe_sqrt, solve_lower, varying_like
 from ..kernels import AbstractKernel
 
 _LOST = 0.5
-"""A wrong part of a(x, x) from which on spectral noise is NaN; at the edge of a box half of a(x, x) is lost."""
+"""A wrong part of a(x, x) from which on noise is NaN; at the edge of a box half of a(x, x) is lost."""
+
+_CONTROLS = 64
+"""Number of controls, unless it is given."""
 
 
 class AbstractNoise(eqx.Module):
@@ -29,6 +44,14 @@ class AbstractNoise(eqx.Module):
 
     fixed_in_space: eqx.AbstractClassVar[bool]
     """Fields fixed in space, whose variance a(x, x) is constant: Itô and Stratonovich readings coincide."""
+
+    def chosen(self, points: Float[Array, "q d"]) -> "AbstractNoise":
+        """For a flow that starts at these points."""
+        return self
+
+    def factored_at(self, points: Float[Array, "q d"]) -> Array | np.ndarray | None:
+        """Which points must be apart, since their covariance is factored; none if not given."""
+        return None
 
     @abc.abstractmethod
     def factor(
@@ -40,6 +63,10 @@ class AbstractNoise(eqx.Module):
         """σ and σσᵀ at the points."""
         sigma = self.factor(kernel, covariance, points)
         return sigma, sigma @ sigma.T
+
+    def energy(self, kernel, covariance, points: Float[Array, "q d"], p: Float[Array, "q d"]) -> Float[Array, ""]:
+        """½ Σ pᵀ σσᵀ p over columns."""
+        return 0.5 * jnp.sum((self.factor(kernel, covariance, points).T @ p) ** 2)
 
     def misfit(self, kernel, covariance, points: Float[Array, "q d"]) -> Float[Array, ""]:
         """By what part of a(x, x) the law at the points is wrong because they are too wide or too near an edge."""
@@ -72,10 +99,21 @@ class LandmarkNoise(AbstractNoise):
                 f"`jitter` must be a number from 0 on, relative to the variance; got {jitter}. 1e-6 is large.",
             )
 
+    def factored_at(self, points):
+        return np.arange(len(points))
+
     def factor(self, kernel, covariance, points):
         return self.factor_and_covariance(kernel, covariance, points)[0]
 
     def factor_and_covariance(self, kernel, covariance, points):
+        factor, none, K = self.factored(covariance, points)
+        return jnp.where(none, 0.0, factor), K
+
+    def energy(self, kernel, covariance, points, p):
+        return 0.5 * jnp.sum(p * (self.factored(covariance, points)[2] @ p))
+
+    def factored(self, covariance, points) -> tuple[Array, Array, Array]:
+        """A factor that has an inverse, whether there is no noise at all, and the covariance."""
         K = covariance.matrix(points, points)
         jitter = self.jitter
         if jitter is None:
@@ -83,8 +121,176 @@ class LandmarkNoise(AbstractNoise):
         variance = covariance.variance.astype(K.dtype)
         K = add(K, jitter.astype(K.dtype) * variance)
         none = variance == 0  # an amplitude that underflows
-        factor = cholesky(jnp.where(none, jnp.eye(len(K), dtype=K.dtype), K))
-        return jnp.where(none, 0.0, factor), K
+        return cholesky(jnp.where(none, jnp.eye(len(K), dtype=K.dtype), K)), none, K
+
+
+class ControlNoise(AbstractNoise):
+    """Noise of some of the landmarks, the controls c, that moves with the flow and carries the others,
+
+        σ(x) = a(x, c) a(c, c)^{-½},
+
+    m noises per coordinate, whatever the number of landmarks. It is exact where all landmarks are controls. Elsewhere
+    the field between controls is the mean that they tell, and lacks the variance a(x, x) − |σ(x)|²,
+    `flow.noise_error(x)`, which is small where they are nearer to each other than the length scale. It should be small
+    beside the errors of what is observed.
+
+    **Arguments:**
+
+    - `num_points`: m; by default 64, or all landmarks where they are fewer.
+    - `points`: `(m,)`, the indices of the controls. By default they are chosen from the start of a bridge, each as far
+      from those before it as can be. Give them where the start is a parameter, for they should not move with it.
+    - `jitter`: as for `LandmarkNoise`.
+
+    `ControlNoise.within(tolerance, x, kernel)` finds how many are needed. An exact match can see no more rows than
+    there are controls.
+    """
+
+    num_points: int | None = eqx.field(static=True)
+    points: Array | None
+    controls: LandmarkNoise
+    fixed_in_space = False
+
+    def __init__(self, num_points: int | None = None, *, points=None, jitter=None):
+        require(num_points is None or points is None, "Give `num_points` or `points`, not both.")
+        self.num_points = None if num_points is None else positive_integer(num_points, "num_points")
+        self.points = None if points is None else _indices(points)
+        self.controls = LandmarkNoise(jitter)
+
+    @classmethod
+    def within(
+        cls,
+        tolerance: float,
+        x: Float[Array, "n d"],
+        kernel: AbstractKernel | None = None,
+        *,
+        covariance: AbstractKernel | None = None,
+        max_points: int = 512,
+    ) -> "ControlNoise":
+        """As few controls of a shape as miss no more than a part `tolerance` of a(x, x) at any landmark.
+
+        **Arguments:** `kernel` or `covariance`: as of the flow, at the smallest length scale that is of interest.
+
+        **Errors:** `ValueError` where it takes more than `max_points`.
+        """
+        tolerance = known_number(tolerance, "tolerance", "between 0 and 1", lambda t: 0 < t < 1)
+        shape = known_float(x, "x")
+        require(shape.ndim == 2 and shape.size, f"`x` must be a shape (n, dim); got shape {shape.shape}.")
+        require((kernel is None) != (covariance is None), "Give either `kernel` or `covariance`, as to the flow.")
+        covariance = kernel.convolved(shape.shape[1]) if kernel is not None else covariance
+        most = min(len(shape), positive_integer(max_points, "max_points"))
+        order = np.asarray(farthest_points(jnp.asarray(shape), most))
+
+        def missing(m: int) -> float:
+            noise = cls(points=np.sort(order[:m]))
+            return float(noise.misfit(None, covariance, jnp.asarray(shape))) if m < len(shape) else 0.0
+
+        least = missing(most)
+        require(
+            least <= tolerance,
+            f"`tolerance` must be within reach of {most} controls, which miss {least:.2g} of a(x, x); got {tolerance}. "
+            "Give a larger `max_points`, or a kernel with a longer length scale.",
+        )
+        m = bisect.bisect_left(range(1, most), True, key=lambda m: missing(m) <= tolerance) + 1
+        return cls(points=np.sort(order[:m]))
+
+    def chosen(self, points):
+        if self.points is not None:
+            last = concrete(self.points)
+            require(
+                last is None or last[-1] < len(points),
+                f"`points` of `ControlNoise` must be indices below {len(points)}; got {last}.",
+            )
+            return self
+        order = farthest_points(lax.stop_gradient(points), self._count(len(points)))
+        return eqx.tree_at(lambda noise: noise.points, self, jnp.sort(order), is_leaf=lambda leaf: leaf is None)
+
+    def factored_at(self, points):
+        return self.chosen(points).points
+
+    def _count(self, n: int) -> int:
+        m = min(n, _CONTROLS) if self.num_points is None else self.num_points
+        require(m <= n, f"`num_points` of `ControlNoise` must be at most the number of landmarks, {n}; got {m}.")
+        return m
+
+    def factor(self, kernel, covariance, points):
+        return self.factor_and_covariance(kernel, covariance, points)[0]
+
+    def factor_and_covariance(self, kernel, covariance, points):
+        index = self.chosen(points).points
+        assert index is not None
+        if len(index) == len(points):
+            return self.controls.factor_and_covariance(kernel, covariance, points)
+        sigma, missing = self._factor(covariance, points, index)
+        sigma = jnp.where(missing < _LOST, sigma, jnp.nan)
+        return sigma, sigma @ sigma.T
+
+    def _factor(self, covariance, points, index) -> tuple[Array, Array]:
+        """σ, and the part of a(x, x) that is missing at the worst point."""
+        c = points[index]
+        root, none, _ = self.controls.factored(covariance, c)
+        sigma = jnp.where(none, 0.0, solve_lower(root, covariance.matrix(c, points)).T)
+        variance = covariance.variance.astype(sigma.dtype) + none.astype(sigma.dtype)  # 1 where there is none
+        told = jnp.min(jnp.sum(sigma**2, axis=1)) / variance
+        return sigma, jnp.where(none, 0.0, 1 - told)
+
+    def energy(self, kernel, covariance, points, p):
+        index = self.chosen(points).points
+        assert index is not None
+        if len(index) == len(points):
+            return self.controls.energy(kernel, covariance, points, p)
+        c = points[index]
+        root, none, _ = self.controls.factored(covariance, c)
+        pulled = solve_lower(root, covariance.matrix(c, points) @ p)
+        return jnp.where(none, 0.0, 0.5 * jnp.sum(pulled**2))
+
+    def misfit(self, kernel, covariance, points):
+        index = self.chosen(points).points
+        assert index is not None
+        return self._factor(covariance, points, index)[1]
+
+    def room(self, kernel, covariance, points):
+        m = self._count(len(points)) if self.points is None else len(self.points)
+        return (
+            f"its {m} control landmarks are too far apart for the length scale of the covariance. Give "
+            "`ControlNoise(num_points)` more of them, or the points; `ControlNoise.within(tolerance, x, kernel)` finds "
+            "how many"
+        )
+
+    def error(self, kernel, covariance, dim, points):
+        """At the points of the states, the variance that is `missing` at the worst of them."""
+        if points is None:
+            return {}
+        chosen = self.chosen(points[0])
+        return {"missing": jnp.max(jax.vmap(lambda p: chosen.misfit(kernel, covariance, p))(points))}
+
+
+def farthest_points(points: Float[Array, "n d"], m: int) -> Int[Array, " m"]:
+    """Indices of points, each as far as can be from those before it, the first from the mean."""
+
+    def distances(p):
+        return jnp.sum((points - p[None]) ** 2, axis=1)
+
+    def step(nearest, _):
+        index = jnp.argmax(nearest)
+        return jnp.minimum(nearest, distances(points[index])), index
+
+    first = jnp.argmax(distances(jnp.mean(points, axis=0)))
+    start = varying_like(distances(points[first]), points)
+    _, others = lax.scan(step, start, length=m - 1)
+    return jnp.concatenate([first[None], others])
+
+
+def _indices(points) -> Array:
+    """Different rows of a shape, in increasing order."""
+    value = known(points, "points")
+    require(value is not None, "`points` must be known when the program is traced; got a traced array.")
+    assert value is not None
+    good = value.ndim == 1 and value.size and np.all(value == np.round(value)) and np.all(value >= 0)
+    require(
+        good and len(np.unique(value)) == len(value),
+        f"`points` must be different indices of landmarks, (m,) from 0 on; got {words(points)}.",
+    )
+    return jnp.sort(jnp.asarray(value.astype(int)))
 
 
 class SpectralNoise(AbstractNoise):
@@ -257,6 +463,7 @@ class GridNoise(AbstractNoise):
 
 NOISES: dict[str, Callable[[], AbstractNoise]] = {
     "landmark": LandmarkNoise,
+    "control": ControlNoise,
     "spectral": SpectralNoise,
     "grid": GridNoise,
 }

@@ -1,0 +1,195 @@
+"""Noise of control landmarks, and steps whose algebra is that of few noises."""
+
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import numpy as np
+import pytest
+from jax.scipy.special import logsumexp
+
+import numpyro_bridges as nb
+import numpyro_bridges.guiding._guides as guides
+
+pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
+
+N, NUM_STEPS = 24, 4
+S = np.linspace(0, 2 * np.pi, N, endpoint=False)
+X0 = np.stack([np.cos(S), 0.7 * np.sin(S)], 1)
+V = 1.1 * X0 + 0.1 * np.stack([np.sin(2 * S), np.cos(S)], 1)
+KERNEL, SHORT = nb.GaussianKernel(0.3, 0.9), nb.GaussianKernel(1.0, 0.2)
+SEEN = np.arange(N) % 5 > 0
+W = np.linspace(0.5, 1.5, N)
+DOUBLE = np.where(np.arange(N)[:, None] == 2, X0[1], X0)
+
+
+def flow(noise, n=N, kernel=KERNEL):
+    return nb.KunitaFlow(nb.Landmarks(n, 2, weights=W if n == N else None), kernel, noise=noise)
+
+
+def bridge(match, guide, noise=None, v=V):
+    sde = flow(nb.ControlNoise(8) if noise is None else noise)
+    return nb.GuidedBridge(sde, match.at(v), x0=X0, t1=1.3, num_steps=NUM_STEPS, guide=guide)
+
+
+MATCHES = {
+    "all": nb.InexactMatch(0.003),
+    "mask": nb.InexactMatch(0.003, mask=SEEN),
+    "own variances": nb.InexactMatch(np.linspace(0.001, 0.01, N)),
+    "rows": nb.InexactMatch(0.003, np.eye(N)[SEEN]),
+}
+
+
+def seen(match):
+    L = np.asarray(match.operator)
+    return V if L.ndim == 0 else L @ V
+
+
+def normal_log_density(r, S):
+    return -0.5 * np.sum(r * np.linalg.solve(S, r)) - 0.5 * r.shape[1] * np.linalg.slogdet(2 * np.pi * S)[1]
+
+
+@pytest.mark.parametrize("end_weight", [0.0, 0.3])
+@pytest.mark.parametrize("name", MATCHES)
+def test_weight_is_that_of_dense_normals(name, end_weight, key):
+    """u ~ N(AᵀS⁻¹r, I − AᵀS⁻¹A) at every step, with S of all that is seen, in NumPy."""
+    match = MATCHES[name]
+    b = bridge(match, nb.RecedingGuide(end_weight), v=seen(match))
+    assert b.noise_shape == (NUM_STEPS, 8, 2)
+    z = jr.normal(key, b.noise_shape)
+    path, found = (np.asarray(a) for a in b.path_and_log_weight(z))
+    np.testing.assert_allclose(b.noise_from_path(path), z, atol=1e-9)
+
+    L = np.asarray(match.observation(b.sde, b.x0).operator)
+    L = np.diag(np.broadcast_to(L, N)) if L.ndim < 2 else L
+    variance = np.broadcast_to(np.asarray(match.variance), N) / W
+    rows = L.any(axis=1)
+    L, v, D = L[rows], seen(match)[rows], np.diag((np.abs(L) @ variance)[rows])
+    sigmas = [np.asarray(b.sde.diffusion(0.0, jnp.asarray(x))) for x in path]
+    end = np.asarray(b.sde.diffusion(0.0, V)) if name in ("all", "own variances") else None
+    if end is None:
+        end = np.asarray(b.sde.diffusion(0.0, b.end()[1]))
+    ts = np.asarray(b.ts)
+    right = 0.0
+    for k in range(NUM_STEPS):
+        dt, left = ts[k + 1] - ts[k], ts[-1] - ts[k + 1]
+        a = (1 - end_weight) * sigmas[k] @ sigmas[k].T + end_weight * end @ end.T
+        A, M, r = np.sqrt(dt) * L @ sigmas[k], D + left * L @ a @ L.T, v - L @ path[k]
+        S = M + A @ A.T
+        if k == NUM_STEPS - 1:
+            right += normal_log_density(r, S)
+            break
+        u = np.linalg.lstsq(np.sqrt(dt) * sigmas[k], path[k + 1] - path[k], rcond=None)[0]
+        law = np.eye(8) - A.T @ np.linalg.solve(S, A)
+        right += normal_log_density(u, np.eye(8)) - normal_log_density(u - A.T @ np.linalg.solve(S, r), law)
+    np.testing.assert_allclose(found, right, rtol=1e-9, atol=1e-7)
+
+
+def test_geodesic_weight_does_not_depend_on_the_algebra(key, monkeypatch):
+    """A path has the same weight where the algebra is that of all that is seen."""
+    b = bridge(MATCHES["mask"], nb.GeodesicGuide())
+    z = jr.normal(key, b.noise_shape)
+    path, few = b.path_and_log_weight(z)
+    jax.clear_caches()
+    monkeypatch.setattr(guides, "are_few", lambda *_: False)
+    np.testing.assert_allclose(b.log_weight(b.noise_from_path(path)), few, rtol=1e-9)
+    jax.clear_caches()
+
+
+def test_message_of_few_noises_is_dense(monkeypatch):
+    b = bridge(MATCHES["all"], nb.GeodesicGuide(correction=0.5))
+    few = b.log_h(0.4, X0), b.score(0.4, X0)
+    jax.clear_caches()
+    monkeypatch.setattr(guides, "are_few", lambda *_: False)
+    np.testing.assert_allclose(b.log_h(0.4, X0), few[0], rtol=1e-9)
+    np.testing.assert_allclose(b.score(0.4, X0), few[1], rtol=1e-7, atol=1e-8)
+    jax.clear_caches()
+
+
+def test_all_controls_are_landmark_noise():
+    """To the last digit, whatever their order."""
+    z = jr.normal(jr.key(0), (NUM_STEPS, N, 2))
+    by = [bridge(MATCHES["all"], None, noise).log_weight(z) for noise in (nb.LandmarkNoise(), nb.ControlNoise(N))]
+    assert by[0] == by[1]
+
+
+def test_evidence_is_that_of_all_landmarks():
+    """Within 3 joint standard errors, where what is missing, a(x, x)/10⁵, is little beside the errors, a(x, x)/80."""
+    found = []
+    for noise in (nb.LandmarkNoise(), nb.ControlNoise.within(1e-5, X0, KERNEL)):
+        b = nb.GuidedBridge(flow(noise), MATCHES["all"].at(V), x0=X0, t1=1.0, num_steps=15)
+        z = jr.normal(jr.key(1), (600, *b.noise_shape))
+        w = jax.jit(jax.vmap(b.log_weight))(z)
+        found.append((logsumexp(w) - np.log(600), np.std(np.exp(w - np.max(w))) / np.mean(np.exp(w - np.max(w)))))
+    assert b.noise_shape[1] <= N / 2
+    (all_landmarks, spread), (control, other) = found
+    assert abs(all_landmarks - control) < 3 * np.hypot(spread, other) / np.sqrt(600)
+    assert np.hypot(spread, other) / np.sqrt(600) < 0.1
+
+
+def test_missing_variance():
+    """1 − |σ_i|²/a(x, x) of a Gaussian field given its values at the controls, in NumPy; of the worst of two states."""
+    c = np.array([0, 5, 11, 17])
+    path = np.stack([X0, V])
+    sde = flow(nb.ControlNoise(points=c))
+    gap = np.sum((path[:, :, None] - path[:, None]) ** 2, -1)
+    K = np.exp(-gap / (4 * 0.9**2))
+    told = np.stack([np.diag(k[:, c] @ np.linalg.solve(k[np.ix_(c, c)], k[c])) for k in K])
+    with pytest.warns(UserWarning, match="missing"):
+        np.testing.assert_allclose(sde.noise_error(path)["missing"], np.max(1 - told), rtol=1e-6)
+    few = nb.ControlNoise.within(1e-3, X0, KERNEL)
+    m = len(few.points)
+    assert float(flow(few).noise_error(X0)["missing"]) <= 1e-3
+    assert float(flow(nb.ControlNoise(m - 1)).noise_error(X0)["missing"]) > 1e-3
+
+
+def test_controls_are_apart_and_known_by_the_start():
+    """Far points in turn: of four clusters one of each; chosen in a traced program too, and not moved by a path."""
+    clusters = np.array([[0, 0], [4, 0], [0, 4], [4, 4.0]])
+    x = (clusters[:, None] + 0.1 * np.random.default_rng(0).normal(size=(4, 3, 2))).reshape(12, 2)
+    sde = flow(nb.ControlNoise(4), n=12, kernel=nb.GaussianKernel(0.3, 4.0))
+    chosen = sde.closed(0.0, jnp.asarray(x)).noise_field.points
+    np.testing.assert_array_equal(np.asarray(chosen) // 3, np.arange(4))
+    traced = jax.jit(lambda x: sde.closed(0.0, x).noise_field.points)(x)
+    np.testing.assert_array_equal(traced, chosen)
+
+
+def test_default_noise():
+    """All landmarks up to 64, controls of more; half of the variance missing is seen, not computed with."""
+    assert isinstance(flow(None).noise_field, nb.LandmarkNoise)
+    assert isinstance(flow(None, n=65).noise_field, nb.ControlNoise)
+    s = np.linspace(0, 2 * np.pi, 80, endpoint=False)
+    x = np.stack([np.cos(s), np.sin(s)], 1)
+
+    def weight(length_scale):
+        sde = nb.KunitaFlow(nb.Landmarks(80, 2), nb.GaussianKernel(0.3, length_scale), noise=nb.ControlNoise(16))
+        return nb.GuidedBridge(sde, MATCHES["all"].at(x), x0=x, t1=1.0, num_steps=3).log_weight(jnp.zeros((3, 16, 2)))
+
+    values = jax.jit(jax.vmap(weight))(jnp.array([0.5, 0.05]))
+    assert np.isfinite(values[0]) and np.isnan(values[1])
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (lambda: nb.ControlNoise(0), "`num_points` must be .*got 0"),
+        (lambda: nb.ControlNoise(3, points=[0, 1]), "`num_points` or `points`, not both"),
+        (lambda: nb.ControlNoise(points=[0, 0, 2]), "`points` must be different indices"),
+        (lambda: nb.ControlNoise(points=[-1, 2]), "`points` must be different indices"),
+        (lambda: bridge(MATCHES["all"], None, nb.ControlNoise(N + 1)), "`num_points` of `ControlNoise` .*24; got 25"),
+        (lambda: bridge(MATCHES["all"], None, nb.ControlNoise(points=[2, N])), "`points` .*below 24; got"),
+        (lambda: bridge(MATCHES["all"], None, nb.ControlNoise(3)), "`x0` does not fit the noise.*`ControlNoise"),
+        (lambda: nb.ControlNoise.within(1e-6, X0, SHORT, max_points=5), "`tolerance` must be .*5 controls"),
+        (lambda: nb.ControlNoise.within(2.0, X0, KERNEL), "`tolerance` must be between 0 and 1"),
+        (lambda: nb.ControlNoise.within(1e-3, X0), "either `kernel` or `covariance`"),
+        (lambda: nb.KunitaFlow(nb.FourierBasis(2, 2), KERNEL, noise="control"), "`control` noise.*`FourierBasis`"),
+        (
+            lambda: nb.GuidedBridge(
+                flow(nb.ControlNoise(points=[1, 2])), MATCHES["all"].at(V), x0=DOUBLE, t1=1.0, num_steps=2
+            ),
+            "`x0` must have distinct landmarks; 1 and 2 coincide",
+        ),
+    ],
+)
+def test_bad_controls(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        wrong()
