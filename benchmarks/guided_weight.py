@@ -39,7 +39,7 @@ def library_weight(n: int, guide: str = "RecedingGuide"):
     space, match, leading = nb.Landmarks(n, 2), nb.InexactMatch(VARIANCE), getattr(nb, guide)()
 
     def log_weight(parameters, noise):
-        flow = nb.KunitaFlow(space, nb.GaussianKernel(*parameters))
+        flow = nb.KunitaFlow(space, nb.GaussianKernel(*parameters), noise="landmark")
         bridge = nb.GuidedBridge(flow, match.at(v), x0=x0, t1=1.0, num_steps=NUM_STEPS, guide=leading)
         return bridge.log_weight(noise)
 

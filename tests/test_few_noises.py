@@ -9,6 +9,8 @@ from jax.scipy.special import logsumexp
 
 import numpyro_bridges as nb
 import numpyro_bridges.guiding._guides as guides
+import numpyro_bridges.trees._told as told
+from numpyro_bridges.distributions._tree import _problem
 
 pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
 
@@ -193,3 +195,52 @@ def test_default_noise():
 def test_bad_controls(wrong, message):
     with pytest.raises(ValueError, match=message):
         wrong()
+
+
+# Trees.
+
+
+def test_what_is_told_of_a_node_by_few_noises():
+    """In noise coordinates x = σ α: the pruning of standard Brownian motion, with masks and errors of their own, in NumPy."""
+    rng = np.random.default_rng(0)
+    sigma, times = rng.normal(size=(9, 3)), (0.4, 0.7)
+    masks, variances = (np.arange(9) != 2, np.arange(9) < 7), (0.1, 0.3)
+    data = rng.normal(size=(2, 9, 2))
+    part = told.Part.of(jnp.asarray(sigma), jnp.asarray(sigma @ sigma.T))
+    H, f, at_node = 0.0, 0.0, []
+    for v, t, mask, variance in zip(data, times, masks, variances, strict=True):
+        seen = nb.InexactMatch(variance, mask=mask).observation(nb.BrownianMotion(1.0), jnp.asarray(v))
+        at_node.append(told.told_by(part.seen(seen), mask[:, None] * v, jnp.asarray(t), part.a, part.of_state(v)))
+        S = variance * np.eye(mask.sum()) + t * sigma[mask] @ sigma[mask].T
+        H = H + sigma[mask].T @ np.linalg.solve(S, sigma[mask])
+        f = f + sigma[mask].T @ np.linalg.solve(S, v[mask])
+    total = jax.tree.map(lambda a, b: a + b, *at_node)
+    before = told.earlier(total, jnp.asarray(0.5), part.a)
+    for message, along in ((total, np.eye(3)), (before, np.linalg.inv(np.eye(3) + 0.5 * H))):
+        found = part.message(message.information)
+        np.testing.assert_allclose(sigma.T @ found.H @ sigma, along @ H, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(sigma.T @ found.F, along @ f, rtol=1e-8, atol=1e-8)
+    seen, value, kappa, reference = told.as_seen(total, part.a, True)
+    known, R = part.known(seen), np.asarray(part.basis) @ sigma
+    S = np.asarray(seen.factor) @ np.asarray(seen.factor).T + kappa * R @ R.T
+    assert kappa > 0 and known.operator.shape == (3, 9)
+    np.testing.assert_allclose(R.T @ np.linalg.solve(S, R), H, rtol=1e-7)
+    np.testing.assert_allclose(np.asarray(known.operator) @ part.lifted(reference), value, rtol=1e-9)
+
+
+def test_tree_of_few_noises(key):
+    """Where displacements are small all is nearly linear, and messages that lose nothing leave no spread in the weight."""
+    tree = nb.Tree.from_newick("((a:.4,b:.5):.5,c:.6);")
+    small = flow(nb.ControlNoise(8), kernel=nb.GaussianKernel(0.01, 0.9))
+    law = nb.DiffusionTree(small, X0, nb.InexactMatch(3e-6, mask=SEEN), tree=tree, num_steps=2)
+    data = X0 + jnp.array([1.0, 0.5, -0.7])[:, None, None] * (V - X0) / 30
+    z = jr.normal(key, (100, *law.noise_prior().shape()))
+
+    @jax.jit
+    def weights(z):
+        problem = _problem(law.parts, data)
+        return jax.vmap(problem.log_weight)(z), problem.noise_from_paths(problem.paths(z[0]), key)
+
+    log_weights, back = weights(z)
+    np.testing.assert_allclose(back, z[0], atol=1e-7)
+    assert np.std(log_weights) < 0.2

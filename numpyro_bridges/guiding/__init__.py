@@ -12,6 +12,7 @@ from ._edge import (
     retrace_reach as retrace_reach,
     travel as travel,
 )
+from ._few_noises import are_few as are_few
 from ._geodesic import GeodesicGuide as GeodesicGuide, default_guide as default_guide
 from ._guides import (
     AbstractGuide as AbstractGuide,

@@ -231,7 +231,7 @@ class ControlNoise(AbstractNoise):
         sigma = jnp.where(none, 0.0, solve_lower(root, covariance.matrix(c, points)).T)
         variance = covariance.variance.astype(sigma.dtype) + none.astype(sigma.dtype)  # 1 where there is none
         told = jnp.min(jnp.sum(sigma**2, axis=1)) / variance
-        return sigma, jnp.where(none, 0.0, 1 - told)
+        return sigma, lax.select(none, jnp.zeros_like(told), 1 - told)
 
     def energy(self, kernel, covariance, points, p):
         index = self.chosen(points).points

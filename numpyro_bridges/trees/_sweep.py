@@ -38,7 +38,7 @@ from ..sdes import AbstractSDE, AffineStep, BrownianMotion, Displaced
 from ._information import Information
 from ._root import Root
 from ._schedule import Schedule, schedule
-from ._told import as_seen, earlier, told_by
+from ._told import Part, as_seen, earlier, told_by
 from ._tree import Tree
 
 
@@ -388,27 +388,29 @@ class TreeProblem(eqx.Module):
         """Each branch by the mean of what is seen below, of whatever covariance the process has there."""
         first = jax.tree.map(lambda a: a[0], self.branches)
         zero = jnp.zeros((), self.x0.dtype)
-        a = self._edge(first).covariance(zero, jnp.zeros_like(self.x0))
+        part = Part.of(*self._edge(first).noise(zero, jnp.zeros_like(self.x0)))
 
         def of_end(led, branch):
-            return told_by(led.seen, led.observed, branch.length, a, self.x0)
+            return told_by(part.seen(led.seen), led.observed, branch.length, part.a, part.of_state(self.x0))
 
         def of_node(condition, anchor):
-            return told_by(*self._seen(condition, anchor), zero, a, self.x0)
+            seen, observed = self._seen(condition, anchor)
+            return told_by(part.seen(seen), observed, zero, part.a, part.of_state(self.x0))
 
         def joined(total, branch):
-            return earlier(total, branch.length, a), total
+            return earlier(total, branch.length, part.a), total
 
         def led(total, branch):
-            seen, value, beyond, reference = as_seen(total, a, everything)
-            return self._inner_plan(branch, seen, reference, beyond), value
+            seen, value, beyond, reference = as_seen(total, part.a, everything)
+            return self._inner_plan(branch, part.known(seen), part.lifted(reference), beyond), value
 
-        everything = ends.seen.operator.ndim == 1  # for each end the identity
+        # for each end the identity, or fewer directions than ever are seen
+        everything = ends.seen.operator.ndim == 1 or part.basis is not None
         inner = self._of(self.schedule.inner)
         own = self._own_messages(jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
         at_root, totals = self._summed_up(own, joined, inner)
         plans, data = jax.vmap(led)(totals, inner)
-        return UpwardPass(plans, data, ends, at_root.information)
+        return UpwardPass(plans, data, ends, part.message(at_root.information))
 
     def _own_messages(self, messages, of_node):
         """For each node of the tree what is told by what is seen of it and by the ends that hang on it."""

@@ -21,13 +21,59 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._linalg import add, cholesky, congruence, diagonal, promote, solve_lower
+from .._linalg import add, cholesky, compose, congruence, diagonal, promote, solve_lower
 from .._types import State, Structured
 from ..conditioning import Observation
+from ..guiding import are_few
 from ._information import Information
 
 _KEPT = 0.01
 """The part of κ a that does not follow: rounding, of whatever precision, is less than it and so leaves a covariance."""
+
+
+class Part(NamedTuple):
+    """What messages are about: of a displacement x from the root all, or y = Q x where few noises drive it.
+
+    With σ = Qᵀ R at the root, Q of orthonormal rows, a = R Rᵀ is the covariance of y, and a state is taken for Qᵀ y: so
+    are all that the noise reaches where σ stays as it is.
+    """
+
+    basis: Float[Array, "k n"] | None
+    """Q; `None` for all of x."""
+    a: Structured
+
+    @classmethod
+    def of(cls, sigma: Structured, a: Structured) -> "Part":
+        """For a process with this σ and a."""
+        if not are_few(sigma, len(sigma) if sigma.ndim else 0):
+            return cls(None, a)
+        Q, R = jnp.linalg.qr(sigma)
+        return cls(Q.T, R @ R.T)
+
+    def of_state(self, x: State) -> State:
+        """Of a displacement, or a state like it."""
+        return x if self.basis is None else self.basis @ x
+
+    def seen(self, seen: Observation) -> Observation:
+        """What is seen of a state, of y."""
+        if self.basis is None:
+            return seen
+        return Observation(compose(seen.operator, self.basis.T), seen.factor, seen.log_scale)
+
+    def known(self, seen: Observation) -> Observation:
+        """What is known of y, of a state."""
+        if self.basis is None:
+            return seen
+        return Observation(compose(seen.operator, self.basis), seen.factor, seen.log_scale)
+
+    def lifted(self, y: State) -> State:
+        """A displacement with this y."""
+        return y if self.basis is None else self.basis.T @ y
+
+    def message(self, message: Information) -> Information:
+        """Of a displacement."""
+        Q = self.basis
+        return message if Q is None else Information(Q.T @ message.H @ Q, Q.T @ message.F, message.c)
 
 
 class Told(NamedTuple):
