@@ -201,7 +201,7 @@ def test_bad_controls(wrong, message):
 
 
 def test_what_is_told_of_a_node_by_few_noises():
-    """In noise coordinates x = σ α: the pruning of standard Brownian motion, with masks and errors of their own, in NumPy."""
+    """In noise coordinates, x = σ α: the pruning of standard Brownian motion, masks and errors of their own, in NumPy."""
     rng = np.random.default_rng(0)
     sigma, times = rng.normal(size=(9, 3)), (0.4, 0.7)
     masks, variances = (np.arange(9) != 2, np.arange(9) < 7), (0.1, 0.3)
@@ -229,7 +229,7 @@ def test_what_is_told_of_a_node_by_few_noises():
 
 
 def test_tree_of_few_noises(key):
-    """Where displacements are small all is nearly linear, and messages that lose nothing leave no spread in the weight."""
+    """Where displacements are small all is nearly linear, and messages that lose nothing leave the weight no spread."""
     tree = nb.Tree.from_newick("((a:.4,b:.5):.5,c:.6);")
     small = flow(nb.ControlNoise(8), kernel=nb.GaussianKernel(0.01, 0.9))
     law = nb.DiffusionTree(small, X0, nb.InexactMatch(3e-6, mask=SEEN), tree=tree, num_steps=2)
