@@ -229,7 +229,7 @@ def test_what_is_told_of_a_node_by_few_noises():
 
 
 def test_tree_of_few_noises(key):
-    """Where displacements are small all is nearly linear, and messages that lose nothing leave the weight no spread."""
+    """Small displacements are nearly linear: messages that lose nothing leave the weight no spread."""
     tree = nb.Tree.from_newick("((a:.4,b:.5):.5,c:.6);")
     small = flow(nb.ControlNoise(8), kernel=nb.GaussianKernel(0.01, 0.9))
     law = nb.DiffusionTree(small, X0, nb.InexactMatch(3e-6, mask=SEEN), tree=tree, num_steps=2)
