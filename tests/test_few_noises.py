@@ -201,7 +201,7 @@ def test_bad_controls(wrong, message):
 
 
 def test_what_is_told_of_a_node_by_few_noises():
-    """In noise coordinates, x = σ α: the pruning of standard Brownian motion, masks and errors of their own, in NumPy."""
+    """In noise coordinates, x = σ α: the pruning of standard Brownian motion, by NumPy, with masks and own errors."""
     rng = np.random.default_rng(0)
     sigma, times = rng.normal(size=(9, 3)), (0.4, 0.7)
     masks, variances = (np.arange(9) != 2, np.arange(9) < 7), (0.1, 0.3)
