@@ -218,7 +218,7 @@ def table() -> dict[str, Row]:
             space=("space", SPACE),
             kernel=("kernel?", KERNEL),
             covariance="kernel?",
-            noise=("noise or name", nb.LandmarkNoise()),
+            noise="noise or name?",
         ),
         "LandmarkNoise": row(nb.LandmarkNoise, jitter=("number?", 1e-6)),
         "ControlNoise": row(nb.ControlNoise, num_points="count?", points="free", jitter="number?"),

@@ -108,10 +108,10 @@ def test_message_of_few_noises_is_dense(monkeypatch):
 
 
 def test_all_controls_are_landmark_noise():
-    """To the last digit, whatever their order."""
+    """One mechanism, up to rounding, whatever their order."""
     z = jr.normal(jr.key(0), (NUM_STEPS, N, 2))
     by = [bridge(MATCHES["all"], None, noise).log_weight(z) for noise in (nb.LandmarkNoise(), nb.ControlNoise(N))]
-    assert by[0] == by[1]
+    np.testing.assert_allclose(*by, rtol=1e-9)
 
 
 def test_evidence_is_that_of_all_landmarks():
@@ -244,3 +244,61 @@ def test_tree_of_few_noises(key):
     log_weights, back = weights(z)
     np.testing.assert_allclose(back, z[0], atol=1e-7)
     assert np.std(log_weights) < 0.2
+
+
+# What a path does to other points.
+
+
+NOISES = {
+    "landmark": nb.LandmarkNoise(),
+    "control": nb.ControlNoise(8),
+    "spectral": nb.SpectralNoise(3, diameter=3.0),
+}
+
+
+def carried(name, num_steps=12):
+    sde = flow(NOISES[name])
+    z = jr.normal(jr.key(4), (num_steps, sde.noise_size(jnp.asarray(X0)), 2))
+    path = nb.simulate(sde, X0, np.linspace(0, 0.5, num_steps + 1), z)
+    return sde, path, jnp.asarray(np.random.default_rng(1).uniform(-1.2, 1.2, (7, 2)))
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_carry(name):
+    """The landmarks move as they do; there and back is where one was; the map is smooth and keeps its orientation."""
+    sde, path, points = carried(name)
+    np.testing.assert_allclose(sde.carry(path, X0), path, atol=1e-12)
+    np.testing.assert_allclose(sde.carry(path, X0 + 1e-7), path, atol=1e-4)  # beside them the jitter is not
+    there = sde.carry(path, points)
+    np.testing.assert_allclose(sde.carry(path, there[-1], inverse=True), there, atol=1e-10)
+    slopes = jax.jit(jax.vmap(jax.jacfwd(lambda p: sde.carry(path, p[None])[-1, 0])))(points)
+    assert np.all(np.linalg.det(slopes) > 0) and np.max(np.abs(there[-1] - points)) > 0.05
+    step = 1e-5
+    moved = sde.carry(path, points + np.array([step, 0.0]))[-1]
+    np.testing.assert_allclose((moved - there[-1]) / step, slopes[..., 0], rtol=2e-3, atol=2e-3)
+
+
+def test_carry_is_kriging():
+    """One step, in NumPy: a(p, c) a(c, c)⁻¹ Δc."""
+    sde, path, points = carried("control", num_steps=1)
+    c = path[0][np.asarray(sde.closed(0.0, jnp.asarray(X0)).noise_field.points)]
+    index = np.asarray(sde.closed(0.0, jnp.asarray(X0)).noise_field.points)
+
+    def a(p, q):
+        return np.exp(-np.sum((np.asarray(p)[:, None] - np.asarray(q)[None]) ** 2, -1) / (4 * 0.9**2))
+
+    move = a(points, c) @ np.linalg.solve(a(c, c), np.asarray(path[1] - path[0])[index])
+    np.testing.assert_allclose(sde.carry(path, points)[-1], points + move, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (lambda: flow(None).carry(X0, X0), r"`path` must have shape \(K \+ 1, 24, 2\); got \(24, 2\)"),
+        (lambda: flow(None).carry(np.stack([X0, V]), X0[0]), r"`points` must have shape \(q, 2\)"),
+        (lambda: flow(None).carry(np.stack([X0, V]), X0, inverse=1), "`inverse` must be"),
+    ],
+)
+def test_bad_carry(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        wrong()

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._checks import concrete, require, require_instance
+from .._checks import as_float, concrete, flag, require, require_instance
 from .._types import RealScalar, State, Structured
 from ..kernels import AbstractKernel
 from ..spaces import AbstractSpace, Landmarks
@@ -27,6 +27,9 @@ _COINCIDE = 1e-6
 
 _MANY = 64
 """Number of landmarks above which noise is that of controls, if the user does not say."""
+
+_NEWTON = 8
+"""Steps of Newton's method: the digits are doubled by each."""
 
 _SEEN, _REFUSED = 0.01, 0.1
 """Wrong parts of a(x, x) from which on there is a warning, and an error."""
@@ -169,6 +172,48 @@ class KunitaFlow(AbstractSDE):
             warnings.warn(f"the noise is wrong by more than 1 % of a(x, x): {', '.join(large)}.", stacklevel=2)
         return error
 
+    def carry(
+        self, path: Float[Array, "K+1 n dim"], points: Float[Array, "q dim"], *, inverse: bool = False
+    ) -> Float[Array, "K+1 q dim"]:
+        """The flow that a path of landmarks belongs to, applied to any further points: where they are at its times.
+
+        In a step a point p moves by the field that moves the landmarks, a(p, c) a(c, c)⁻¹ Δc, c being the landmarks
+        that drive the flow, all or the controls; of spectral or grid noise the field of least noise. Points that are
+        landmarks of the path move as these do, to the last digit.
+
+        **Arguments:** `path`: the states of a bridge, or of one branch of a tree. `points`: at the first time, or,
+        where `inverse`, at the last: then the way back, by solving each step for the point that it moves there.
+        """
+        path, points = as_float(path, "path"), as_float(points, "points")
+        n, dim = self.space.size, self.space.dim
+        require(
+            path.ndim == 3 and path.shape[1:] == (n, dim) and len(path) > 1,
+            f"`path` must have shape (K + 1, {n}, {dim}); got {path.shape}. Use vmap for a batch.",
+        )
+        require(
+            points.ndim == 2 and points.shape[1] == dim,
+            f"`points` must have shape (q, {dim}); got {points.shape}.",
+        )
+        chosen = self.closed(jnp.zeros((), path.dtype), path[0])
+
+        def move(p, ends):
+            p = p + chosen._velocity(*ends)(p)
+            return p, p
+
+        def move_back(p, ends):
+            p = _origin_of(chosen._velocity(*ends), p)
+            return p, p
+
+        ends = (path[:-1], path[1:])
+        _, moved = lax.scan(move_back if flag(inverse, "inverse") else move, points, ends, reverse=inverse)
+        moved = jnp.concatenate([moved, points[None]] if inverse else [points[None], moved])
+        same = jnp.all(points[:, None] == path[-1 if inverse else 0][None], axis=-1)
+        return jnp.where(jnp.any(same, axis=1)[None, :, None], path[:, jnp.argmax(same, axis=1)], moved)
+
+    def _velocity(self, x: State, x_next: State):
+        points, moves = self.space.to_points(x), self.space.to_points(x_next - x)
+        return self.noise_field.velocity(self.kernel, self.covariance_kernel, points, moves)
+
     def start(self, x: State) -> State:
         index = self.noise_field.factored_at(x)
         if concrete(x) is not None or index is None or len(index) == 1:
@@ -214,6 +259,19 @@ class KunitaFlow(AbstractSDE):
         )
         require(not refuse or lost < _REFUSED, message)
         warnings.warn(message, stacklevel=3)
+
+
+def _origin_of(velocity: Callable, points: Float[Array, "q d"]) -> Float[Array, "q d"]:
+    """The p with p + velocity(p) = points, by Newton's method from the points themselves."""
+
+    def residual(p, end):
+        return p + velocity(p[None])[0] - end
+
+    def newton(_, p):
+        slope = jax.vmap(jax.jacfwd(residual))(p, points)
+        return p - jnp.linalg.solve(slope, jax.vmap(residual)(p, points)[..., None])[..., 0]
+
+    return lax.fori_loop(0, _NEWTON, newton, points)
 
 
 def _known(tree) -> bool:

@@ -50,8 +50,15 @@ class AbstractNoise(eqx.Module):
         return self
 
     def factored_at(self, points: Float[Array, "q d"]) -> Array | np.ndarray | None:
-        """Which points must be apart, since their covariance is factored; none if not given."""
+        """Which points must be apart, since their covariance is factored; `None` if none of them."""
         return None
+
+    def velocity(
+        self, kernel, covariance, points: Float[Array, "q d"], moves: Float[Array, "q d"]
+    ) -> Callable[[Float[Array, "s d"]], Float[Array, "s d"]]:
+        """The field that moves the points like this, anywhere: of those that do, that of least noise."""
+        u = jnp.linalg.lstsq(self.factor(kernel, covariance, points), moves)[0]
+        return lambda others: self.factor(kernel, covariance, others) @ u
 
     @abc.abstractmethod
     def factor(
@@ -111,6 +118,11 @@ class LandmarkNoise(AbstractNoise):
 
     def energy(self, kernel, covariance, points, p):
         return 0.5 * jnp.sum(p * (self.factored(covariance, points)[2] @ p))
+
+    def velocity(self, kernel, covariance, points, moves):
+        root, none, _ = self.factored(covariance, points)
+        weights = solve_lower(root, solve_lower(root, moves), transposed=True)
+        return lambda others: jnp.where(none, 0.0, covariance.matrix(others, points) @ weights)
 
     def factored(self, covariance, points) -> tuple[Array, Array, Array]:
         """A factor that has an inverse, whether there is no noise at all, and the covariance."""
@@ -205,7 +217,9 @@ class ControlNoise(AbstractNoise):
         return eqx.tree_at(lambda noise: noise.points, self, jnp.sort(order), is_leaf=lambda leaf: leaf is None)
 
     def factored_at(self, points):
-        return self.chosen(points).points
+        index = self.chosen(points).points
+        assert index is not None
+        return index
 
     def _count(self, n: int) -> int:
         m = min(n, _CONTROLS) if self.num_points is None else self.num_points
@@ -213,40 +227,34 @@ class ControlNoise(AbstractNoise):
         return m
 
     def factor(self, kernel, covariance, points):
-        return self.factor_and_covariance(kernel, covariance, points)[0]
+        sigma, missing = self._factor_and_missing(covariance, points)
+        return jnp.where(missing < _LOST, sigma, jnp.nan)
 
-    def factor_and_covariance(self, kernel, covariance, points):
-        index = self.chosen(points).points
-        assert index is not None
-        if len(index) == len(points):
-            return self.controls.factor_and_covariance(kernel, covariance, points)
-        sigma, missing = self._factor(covariance, points, index)
-        sigma = jnp.where(missing < _LOST, sigma, jnp.nan)
-        return sigma, sigma @ sigma.T
+    def _crossed(self, covariance, points) -> tuple[Array, Array, Array]:
+        """A factor of a(c, c), whether there is no noise at all, and a(c, x)."""
+        index = self.factored_at(points)
+        root, none, K = self.controls.factored(covariance, points[index])
+        across = covariance.matrix(points[index], points).at[:, index].set(K)  # the controls move as landmarks do
+        return root, none, across
 
-    def _factor(self, covariance, points, index) -> tuple[Array, Array]:
+    def _factor_and_missing(self, covariance, points) -> tuple[Array, Array]:
         """σ, and the part of a(x, x) that is missing at the worst point."""
-        c = points[index]
-        root, none, _ = self.controls.factored(covariance, c)
-        sigma = jnp.where(none, 0.0, solve_lower(root, covariance.matrix(c, points)).T)
+        root, none, across = self._crossed(covariance, points)
+        sigma = jnp.where(none, 0.0, solve_lower(root, across).T)
         variance = covariance.variance.astype(sigma.dtype) + none.astype(sigma.dtype)  # 1 where there is none
         told = jnp.min(jnp.sum(sigma**2, axis=1)) / variance
-        return sigma, lax.select(none, jnp.zeros_like(told), 1 - told)
+        return sigma, lax.select(none, jnp.zeros_like(told), jnp.maximum(1 - told, 0))
 
     def energy(self, kernel, covariance, points, p):
-        index = self.chosen(points).points
-        assert index is not None
-        if len(index) == len(points):
-            return self.controls.energy(kernel, covariance, points, p)
-        c = points[index]
-        root, none, _ = self.controls.factored(covariance, c)
-        pulled = solve_lower(root, covariance.matrix(c, points) @ p)
-        return jnp.where(none, 0.0, 0.5 * jnp.sum(pulled**2))
+        root, none, across = self._crossed(covariance, points)
+        return jnp.where(none, 0.0, 0.5 * jnp.sum(solve_lower(root, across @ p) ** 2))
+
+    def velocity(self, kernel, covariance, points, moves):
+        index = self.factored_at(points)
+        return self.controls.velocity(kernel, covariance, points[index], moves[index])
 
     def misfit(self, kernel, covariance, points):
-        index = self.chosen(points).points
-        assert index is not None
-        return self._factor(covariance, points, index)[1]
+        return self._factor_and_missing(covariance, points)[1]
 
     def room(self, kernel, covariance, points):
         m = self._count(len(points)) if self.points is None else len(self.points)
