@@ -94,6 +94,8 @@ class KunitaFlow(AbstractSDE):
         self.noise_field = noise_field
 
     def closed(self, t: RealScalar, x: State) -> "KunitaFlow":
+        if x.shape != (self.space.size, self.space.dim):
+            return self  # no state: `check_state` says so
         chosen = self.noise_field.chosen(self.space.to_points(x))
         return eqx.tree_at(lambda flow: flow.noise_field, self, chosen)
 
@@ -108,8 +110,8 @@ class KunitaFlow(AbstractSDE):
         return sigma, sigma @ sigma.T
 
     def energy(self, t: RealScalar, x: State, p: State) -> Float[Array, ""]:
-        if isinstance(self.space, Landmarks):
-            return self.noise_field.energy(self.kernel, self.covariance_kernel, x, p)
+        if isinstance(self.noise_field, ControlNoise):
+            return self.noise_field.energy(self.covariance_kernel, x, p)
         return super().energy(t, x, p)
 
     def covariance_divergence(self, t: RealScalar, x: State) -> State:

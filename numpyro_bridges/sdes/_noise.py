@@ -71,10 +71,6 @@ class AbstractNoise(eqx.Module):
         sigma = self.factor(kernel, covariance, points)
         return sigma, sigma @ sigma.T
 
-    def energy(self, kernel, covariance, points: Float[Array, "q d"], p: Float[Array, "q d"]) -> Float[Array, ""]:
-        """½ Σ pᵀ σσᵀ p over columns."""
-        return 0.5 * jnp.sum((self.factor(kernel, covariance, points).T @ p) ** 2)
-
     def misfit(self, kernel, covariance, points: Float[Array, "q d"]) -> Float[Array, ""]:
         """By what part of a(x, x) the law at the points is wrong because they are too wide or too near an edge."""
         return jnp.zeros((), points.dtype)
@@ -115,9 +111,6 @@ class LandmarkNoise(AbstractNoise):
     def factor_and_covariance(self, kernel, covariance, points):
         factor, none, K = self.factored(covariance, points)
         return jnp.where(none, 0.0, factor), K
-
-    def energy(self, kernel, covariance, points, p):
-        return 0.5 * jnp.sum(p * (self.factored(covariance, points)[2] @ p))
 
     def velocity(self, kernel, covariance, points, moves):
         root, none, _ = self.factored(covariance, points)
@@ -245,7 +238,8 @@ class ControlNoise(AbstractNoise):
         told = jnp.min(jnp.sum(sigma**2, axis=1)) / variance
         return sigma, lax.select(none, jnp.zeros_like(told), jnp.maximum(1 - told, 0))
 
-    def energy(self, kernel, covariance, points, p):
+    def energy(self, covariance, points, p) -> Array:
+        """½ Σ pᵀ σσᵀ p over columns, without σ."""
         root, none, across = self._crossed(covariance, points)
         return jnp.where(none, 0.0, 0.5 * jnp.sum(solve_lower(root, across @ p) ** 2))
 
