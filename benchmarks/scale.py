@@ -1,6 +1,6 @@
 """What does a guided weight cost as the number of landmarks grows, beside noise of all landmarks?
 
-    python benchmarks/scale.py [--sizes 32 128 1000] [--length-scales 0.4 0.1] [--guides GeodesicGuide] [--threads 1]
+    python benchmarks/scale.py [--sizes 32 128 1000] [--length-scales 0.4 0.1] [--guides GeodesicGuide]
 
 One path of 100 steps between two outlines of diameter 2.5, controls by a tolerance of 1e-3, one core: value, and
 gradient with respect to the noise, the amplitude and the length scale. A JSON line for each size: seconds (the minimum
@@ -9,11 +9,10 @@ from the size before. `--memory`: of one size, the peak memory of the process af
 """
 
 import argparse
-import json
+import functools
 import os
 import resource
 import sys
-import time
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -21,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from trees import compiled, seconds, show
 
 import numpyro_bridges as nb
 
@@ -51,25 +51,6 @@ def weight(n: int, length_scale: float, noise, guide: str):
     return log_weight, (parameters, z)
 
 
-def compiled(f, arguments):
-    start = time.perf_counter()
-    program = jax.jit(f).lower(*arguments).compile()
-    return program, time.perf_counter() - start
-
-
-def seconds(programs, repeats: int) -> list[float]:
-    """The minimum over repeats, the programs in turn."""
-    best = [np.inf] * len(programs)
-    for program, arguments in programs:
-        jax.block_until_ready(program(*arguments))
-    for _ in range(repeats):
-        for i, (program, arguments) in enumerate(programs):
-            start = time.perf_counter()
-            jax.block_until_ready(program(*arguments))
-            best[i] = min(best[i], time.perf_counter() - start)
-    return best
-
-
 def measure(n: int, length_scale: float, guide: str, repeats: int, memory: bool) -> dict:
     x0, _ = outlines(n)
     control = nb.ControlNoise.within(1e-3, x0, covariance=nb.GaussianKernel(0.04, length_scale))
@@ -79,18 +60,20 @@ def measure(n: int, length_scale: float, guide: str, repeats: int, memory: bool)
         noises["landmark"] = nb.LandmarkNoise()
     weights = {name: weight(n, length_scale, noise, guide) for name, noise in noises.items()}
     for kind in ("value", "gradient"):
-        programs = []
+        programs = {}
         for name, (f, arguments) in weights.items():
             f = f if kind == "value" else jax.grad(f, argnums=(0, 1))
-            program, took = compiled(f, arguments)
-            row[f"{kind}_{name}_compile_s"] = round(took, 2)
-            programs.append((program, arguments))
-        for name, took in zip(weights, seconds(programs, repeats), strict=True):
-            row[f"{kind}_{name}_s"] = round(took, 5)
+            program, row[f"{kind}_{name}_compile_s"] = compiled(f, *arguments)
+            programs[name] = functools.partial(program, *arguments)
+            seconds(programs[name], 1)  # the first run is not counted
+            row[f"{kind}_{name}_s"] = np.inf
+        for _ in range(repeats):  # in turn
+            for name, program in programs.items():
+                row[f"{kind}_{name}_s"] = min(row[f"{kind}_{name}_s"], seconds(program, 1))
         if "landmark" in weights:
-            row[f"{kind}_ratio"] = round(row[f"{kind}_landmark_s"] / row[f"{kind}_control_s"], 2)
+            row[f"{kind}_ratio"] = row[f"{kind}_landmark_s"] / row[f"{kind}_control_s"]
         if memory:
-            row[f"{kind}_peak_gib"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
+            row[f"{kind}_peak_gib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return row
 
 
@@ -103,8 +86,8 @@ def main(arguments):
                 if before is not None:
                     for kind in ("value", "gradient"):
                         growth = row[f"{kind}_control_s"] / before[f"{kind}_control_s"]
-                        row[f"{kind}_exponent"] = round(np.log(growth) / np.log(n / before["n"]), 2)
-                print(json.dumps(row), flush=True)
+                        row[f"{kind}_exponent"] = np.log(growth) / np.log(n / before["n"])
+                show(row)
                 before = row
 
 

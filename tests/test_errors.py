@@ -126,11 +126,11 @@ SDES = [
         "`noise` must be one of .*'control', 'grid', 'landmark', 'spectral'.*got 'fourier'",
     ),
     ("noise-number", lambda: flow(noise=3), "`noise` must be one of .* or a noise object; got 3"),
-    ("noise-of-a-basis", lambda: flow(space=BASIS), '`landmark` noise.*`FourierBasis`.*Use `noise="spectral"` or'),
+    ("noise-of-a-basis", lambda: flow(space=BASIS), '`noise="landmark"`.*`FourierBasis`.*Use `noise="spectral"` or'),
     (
         "noise-object-of-a-basis",
         lambda: flow(space=BASIS, noise=nb.LandmarkNoise()),
-        "`LandmarkNoise` noise.*`FourierBasis`",
+        '`noise="landmark"`.*`FourierBasis`',
     ),
     (
         "grid-without-kernel",

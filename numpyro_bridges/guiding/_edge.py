@@ -133,9 +133,10 @@ def _last_step(sde, seen, ts, x, observed) -> tuple[Transition, GaussianSteering
     covariance = None if seen.exact else seen.covariance
     dt = ts[-1] - ts[-2]
     if is_low_rank(transition.factor, seen):
+        assert seen.factor is not None
         sigma, _ = per_time(transition, dt)
         none = jnp.zeros((), x.dtype)
-        covariance = LowRank(Errors.of(seen.covariance), none, compose(seen.operator, sigma), none)
+        covariance = LowRank(Errors.of(seen.factor), none, compose(seen.operator, sigma), none)
     shift = jnp.zeros_like(observed)
     return transition, steered(transition, dt, seen.operator, shift, covariance, observed, seen.exact)
 

@@ -16,11 +16,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import add, apply, cholesky, columns, congruence, log_diagonal, rows, solve_lower, transpose
+from .._linalg import add, apply, cholesky, columns, congruence, log_diagonal, solve_lower, transpose
 from .._types import Noise, State, Structured
+from ..conditioning import whitened_log_density
 from ._steering import AbstractSteering, log_ratio
-
-_LOG_2PI = 1.8378770664093453
 
 
 def are_few(sigma: Structured, num_values: int) -> bool:
@@ -39,17 +38,12 @@ class Errors(eqx.Module):
     """Fᵀ D⁻¹ F."""
 
     @classmethod
-    def of(cls, variance: Structured, factor: Float[Array, "m q"] | None = None) -> "Errors":
-        """From D and F."""
-        sd = jnp.sqrt(variance)
+    def of(cls, sd: Structured, factor: Float[Array, "m q"] | None = None) -> "Errors":
+        """From √D and F."""
         if factor is None:
             return cls(sd)
-        factor = _divided(factor, sd)
+        factor = solve_lower(sd, factor)
         return cls(sd, factor, factor.T @ factor)
-
-
-def _divided(x, sd):
-    return x / (sd if sd.ndim == 0 else rows(sd, x))
 
 
 class LowRank(eqx.Module):
@@ -71,7 +65,7 @@ class LowRank(eqx.Module):
 
     def __init__(self, errors: Errors, end_scale, factor: Float[Array, "m k"], scale):
         self.errors, self.end_scale, self.scale = errors, end_scale, scale
-        self.factor = _divided(factor, errors.sd)
+        self.factor = solve_lower(errors.sd, factor)
         self.gram, self.across = self.factor.T @ self.factor, None
         if errors.factor is not None:
             self.across = solve_lower(self._end_root, errors.factor.T @ self.factor)
@@ -90,7 +84,7 @@ class LowRank(eqx.Module):
 
     def pull(self, r: State) -> Noise:
         """(I + κ C)⁻¹ f."""
-        r = _divided(r, self.errors.sd)
+        r = solve_lower(self.errors.sd, r)
         f = apply(transpose(self.factor), r)
         if self.across is not None:
             assert self.errors.factor is not None
@@ -106,12 +100,12 @@ class LowRank(eqx.Module):
     def solve(self, r: State) -> State:
         """(E + κ G Gᵀ)⁻¹ r."""
         sd, F = self.errors.sd, self.errors.factor
-        left = _divided(r, sd) - self.scale * apply(self.factor, self.pull(r))
+        left = solve_lower(sd, r) - self.scale * apply(self.factor, self.pull(r))
         if F is not None:
             N = self._end_root
             back = solve_lower(N, solve_lower(N, apply(transpose(F), left)), transposed=True)
             left = left - self.end_scale * apply(F, back)
-        return _divided(left, sd)
+        return solve_lower(sd, left)
 
     def dense(self) -> Structured:
         """E + κ G Gᵀ."""
@@ -154,7 +148,5 @@ class NoiseSteering(AbstractSteering):
         By what is left of r at the mean, whose digits are those of the errors.
         """
         u, sd = self.mean(), self.covariance.errors.sd
-        left = _divided(self.r, sd) - self.step * apply(self.covariance.factor, u)
-        m, dim = len(left), columns(left)
-        log_det = log_diagonal(sd, m) + log_diagonal(self.factor, len(u)) + 0.5 * m * _LOG_2PI
-        return -0.5 * (jnp.sum(left * left) + jnp.sum(u * u)) - dim * log_det
+        left = solve_lower(sd, self.r) - self.step * apply(self.covariance.factor, u)
+        return whitened_log_density(left, sd) - 0.5 * jnp.sum(u * u) - columns(u) * log_diagonal(self.factor, len(u))

@@ -249,7 +249,8 @@ class RecedingGuide(AbstractGuide):
         sigma, a = sde.noise(ts[-1], reference)
         w, errors = self.end_weight, None
         if is_low_rank(sigma, seen) and ndim == 0:
-            errors = Errors.of(seen.covariance, None if w is None else compose(seen.operator, sigma))
+            assert seen.factor is not None
+            errors = Errors.of(seen.factor, None if w is None else compose(seen.operator, sigma))
         return RecedingPlan(planned, seen, None if w is None else _End(w, a), errors)
 
 

@@ -20,13 +20,10 @@ from .._types import RealScalar, State, Structured
 from ..kernels import AbstractKernel
 from ..spaces import AbstractSpace, Landmarks
 from ._base import AbstractSDE, at_any_time
-from ._noise import NOISES, AbstractNoise, ControlNoise, LandmarkNoise
+from ._noise import MOST_CONTROLS, NOISES, AbstractNoise, ControlNoise, LandmarkNoise, name_of
 
 _COINCIDE = 1e-6
 """Distance of two landmarks, relative to the size of the shape, at which they are one."""
-
-_MANY = 64
-"""Number of landmarks above which noise is that of controls, if the user does not say."""
 
 _NEWTON = 8
 """Steps of Newton's method: the digits are doubled by each."""
@@ -72,7 +69,7 @@ class KunitaFlow(AbstractSDE):
             if k is not None:
                 require_instance(k, AbstractKernel, name, "a kernel, such as `GaussianKernel(amplitude, length_scale)`")
         if noise is None:
-            noise = "control" if isinstance(space, Landmarks) and space.size > _MANY else "landmark"
+            noise = "control" if isinstance(space, Landmarks) and space.size > MOST_CONTROLS else "landmark"
         if isinstance(noise, str):
             require(noise in NOISES, f"`noise` must be one of {sorted(NOISES)} or a noise object; got {noise!r}.")
             noise_field: AbstractNoise = NOISES[noise]()
@@ -81,9 +78,8 @@ class KunitaFlow(AbstractSDE):
             noise_field = noise
         require(
             isinstance(space, Landmarks) or noise_field.fixed_in_space,
-            f"`{noise if isinstance(noise, str) else type(noise).__name__}` noise is attached to landmarks, and the "
-            "coefficients of a `FourierBasis` are none: their covariance has no points to be factored at. Use "
-            '`noise="spectral"` or `noise="grid"`.',
+            f'`noise="{name_of(noise_field)}"` is attached to landmarks, and the coefficients of a `FourierBasis` are '
+            'none: their covariance has no points to be factored at. Use `noise="spectral"` or `noise="grid"`.',
         )
         if kernel is not None:
             covariance = kernel.convolved(space.dim)
@@ -196,25 +192,20 @@ class KunitaFlow(AbstractSDE):
             points.ndim == 2 and points.shape[1] == dim,
             f"`points` must have shape (q, {dim}); got {points.shape}.",
         )
-        chosen = self.closed(jnp.zeros((), path.dtype), path[0])
+        inverse = flag(inverse, "inverse")
+        shapes = jax.vmap(self.space.to_points)(path)
+        field = self.noise_field.chosen(shapes[0])
 
-        def move(p, ends):
-            p = p + chosen._velocity(*ends)(p)
+        def step(p, inputs):
+            shape, moves = inputs
+            velocity = field.velocity(self.kernel, self.covariance_kernel, shape, moves)
+            p = _origin_of(velocity, p) if inverse else p + velocity(p)
             return p, p
 
-        def move_back(p, ends):
-            p = _origin_of(chosen._velocity(*ends), p)
-            return p, p
-
-        ends = (path[:-1], path[1:])
-        _, moved = lax.scan(move_back if flag(inverse, "inverse") else move, points, ends, reverse=inverse)
+        _, moved = lax.scan(step, points, (shapes[:-1], jnp.diff(shapes, axis=0)), reverse=inverse)
         moved = jnp.concatenate([moved, points[None]] if inverse else [points[None], moved])
-        same = jnp.all(points[:, None] == path[-1 if inverse else 0][None], axis=-1)
-        return jnp.where(jnp.any(same, axis=1)[None, :, None], path[:, jnp.argmax(same, axis=1)], moved)
-
-    def _velocity(self, x: State, x_next: State):
-        points, moves = self.space.to_points(x), self.space.to_points(x_next - x)
-        return self.noise_field.velocity(self.kernel, self.covariance_kernel, points, moves)
+        same = jnp.all(points[:, None] == shapes[-1 if inverse else 0][None], axis=-1)
+        return jnp.where(jnp.any(same, axis=1)[None, :, None], shapes[:, jnp.argmax(same, axis=1)], moved)
 
     def start(self, x: State) -> State:
         index = self.noise_field.factored_at(x)

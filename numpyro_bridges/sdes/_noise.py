@@ -35,8 +35,8 @@ from ..kernels import AbstractKernel
 _LOST = 0.5
 """A wrong part of a(x, x) from which on noise is NaN; at the edge of a box half of a(x, x) is lost."""
 
-_CONTROLS = 64
-"""Number of controls, unless it is given."""
+MOST_CONTROLS = 64
+"""Number of controls, unless it is given: up to here all landmarks are."""
 
 
 class AbstractNoise(eqx.Module):
@@ -200,10 +200,11 @@ class ControlNoise(AbstractNoise):
 
     def chosen(self, points):
         if self.points is not None:
-            last = concrete(self.points)
+            known_points = concrete(self.points)
+            last = -1 if known_points is None else int(known_points[-1])
             require(
-                last is None or last[-1] < len(points),
-                f"`points` of `ControlNoise` must be indices below {len(points)}; got {last}.",
+                last < len(points),
+                f"`points` of `ControlNoise` must be indices below {len(points)}; got {words(last)}.",
             )
             return self
         order = farthest_points(lax.stop_gradient(points), self._count(len(points)))
@@ -215,7 +216,7 @@ class ControlNoise(AbstractNoise):
         return index
 
     def _count(self, n: int) -> int:
-        m = min(n, _CONTROLS) if self.num_points is None else self.num_points
+        m = min(n, MOST_CONTROLS) if self.num_points is None else self.num_points
         require(m <= n, f"`num_points` of `ControlNoise` must be at most the number of landmarks, {n}; got {m}.")
         return m
 
@@ -469,3 +470,9 @@ NOISES: dict[str, Callable[[], AbstractNoise]] = {
     "spectral": SpectralNoise,
     "grid": GridNoise,
 }
+
+
+def name_of(noise: AbstractNoise) -> str:
+    """By which `KunitaFlow` knows it."""
+    (name,) = [name for name, kind in NOISES.items() if kind is type(noise)] or [type(noise).__name__]
+    return name
