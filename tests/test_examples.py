@@ -171,7 +171,6 @@ def test_conditioning_paper_reads_files(tmp_path):
     assert "RMS displacement" in run(str(ROOT / "examples/conditioning_paper.py"), *chosen, cwd=tmp_path)
 
 
-@pytest.mark.slow
 def test_calibration(tmp_path):
     """One model and kernel. By chance it fails once in 10 000 draws of the replicates."""
     pytest.importorskip("matplotlib")
