@@ -48,8 +48,17 @@ from .sdes import (
     KunitaFlow as KunitaFlow,
     LandmarkNoise as LandmarkNoise,
     LinearSDE as LinearSDE,
+    SemilinearSDE as SemilinearSDE,
     SpectralNoise as SpectralNoise,
     simulate as simulate,
 )
-from .spaces import AbstractSpace as AbstractSpace, FourierBasis as FourierBasis, Landmarks as Landmarks
+from .spaces import (
+    AbstractBasis as AbstractBasis,
+    AbstractSpace as AbstractSpace,
+    CosineBasis as CosineBasis,
+    FourierBasis as FourierBasis,
+    FourierSquare as FourierSquare,
+    Landmarks as Landmarks,
+    SineBasis as SineBasis,
+)
 from .trees import Tree as Tree

@@ -18,6 +18,7 @@ from .conditioning import AbstractCondition, GaussianMessage, Observation, Targe
 from .guiding import (
     AbstractGuide,
     AbstractPlan,
+    FrozenGuide,
     GuidedStep,
     GuidedTerm,
     default_guide,
@@ -78,7 +79,7 @@ class GuidedBridge(eqx.Module):
       default is uniform, and graded towards t1, t = s(2 − s/T), where the end state is pinned. A grid whose steps
       vanish in the precision used is refused.
     - `guide`: by default `FrozenGuide()` where a is constant, `GeodesicGuide()` for a Kunita flow, `RecedingGuide()`
-      where a depends on the state otherwise.
+      where a depends on the state otherwise, both with `rounds=2` for a `SemilinearSDE`.
     - `solver`: by default the guided step with its exact discrete weight. An Itô diffrax solver steps the guided drift
       instead, with the continuous-time weight: consistent as dt → 0, biased at fixed dt, and no target for MCMC. A
       Stratonovich solver is refused unless both readings of the SDE coincide.
@@ -125,6 +126,7 @@ class GuidedBridge(eqx.Module):
         condition.check(sde, x0)
         if guide is None:
             guide = default_guide(sde, x0)
+            guide = FrozenGuide() if solver is not None and isinstance(guide, FrozenGuide) else guide
         require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         guide.check(sde, x0)
         self.sde, self.condition, self.x0 = sde, condition, x0
@@ -244,13 +246,13 @@ class GuidedBridge(eqx.Module):
         free, ts = self.x0, self.shown_ts
         dt = jnp.diff(self.grid.elapsed)
 
-        def drift_step(x, step):
+        def without_noise(x, step):
             t, dt = step
-            return x + dt * self.sde.drift(t, x), None
+            return self.sde.transition(t, t + dt, x).mean, None
 
         if seen.operator.ndim or self.condition.num_extra_noises:  # part of the end state is open
             start = varying_like(free, self.sde, ts, dt)
-            free, _ = jax.lax.scan(drift_step, start, (ts[:-1], dt))
+            free, _ = jax.lax.scan(without_noise, start, (ts[:-1], dt))
         reference = self.condition.reference(self.sde, free)
         return seen, reference
 
@@ -315,7 +317,7 @@ class GuidedBridge(eqx.Module):
         if not self._is_discrete:
             return self._value_and_score(problem, None, None, since, problem.frame.start)
         ts = jnp.concatenate([problem.ts[:1], jnp.maximum(problem.ts, since)])
-        plan = self.guide.plan(problem.frame.sde, problem.seen, problem.reference, ts)
+        plan = self.plan(self.guide, problem, ts)
         entry = jax.tree.map(lambda a: a[1], plan.steps)
         return self._value_and_score(problem, plan, entry, since, problem.frame.start)
 
@@ -326,7 +328,7 @@ class GuidedBridge(eqx.Module):
         y = path[:-1] - problem.frame.origins[:-1]
         if not self._is_discrete:
             return jax.vmap(lambda t, y: self._value_and_score(problem, None, None, t, y)[1])(ts, y)
-        plan = self.guide.plan(problem.frame.sde, problem.seen, problem.reference, problem.ts)
+        plan = self.plan(self.guide, problem)
         along = jax.vmap(lambda entry, t, y: self._value_and_score(problem, plan, entry, t, y)[1])
         return along(plan.steps, ts, y)
 
@@ -366,7 +368,15 @@ class GuidedBridge(eqx.Module):
         """`None` for a diffrax solver."""
         if not self._is_discrete:
             return None
-        return self.guide.plan(problem.frame.sde, problem.seen, problem.reference, problem.ts)
+        return self.plan(self.guide, problem)
+
+    def plan(self, guide: AbstractGuide, problem: Problem, ts: Array | None = None) -> AbstractPlan:
+        """A guide's plan for the grid, or for one with the same end."""
+        frame, _, seen, reference, grid = problem
+        observed = apply(seen.operator, reference)
+        start = self.x0 - frame.origins[-1]
+        guide = guide.prepared(frame.sde, seen, observed, reference, grid, start)
+        return guide.plan(frame.sde, seen, reference, grid if ts is None else ts)
 
     @eqx.filter_jit
     @full_precision

@@ -181,6 +181,16 @@ def table() -> dict[str, Row]:
         "FourierBasis": row(
             nb.FourierBasis, num_modes=("count", 1), dim=("count", 2), num_quadrature=("count?", 8)
         ),
+        **{
+            kind.__name__: row(
+                kind,
+                num_modes=("count", 1),
+                dim=("count", 2),
+                num_quadrature=("count?", 8),
+                **({} if kind is nb.FourierSquare else {"length": ("number", 2.0)}),
+            )
+            for kind in (nb.SineBasis, nb.CosineBasis, nb.FourierSquare)
+        },
         "GaussianKernel": row(
             nb.GaussianKernel, amplitude=("number", 0.5), length_scale=("number", 1.0)
         ),
@@ -210,6 +220,14 @@ def table() -> dict[str, Row]:
             nb.SDE,
             drift=("function", drift),
             diffusion=("function", constant),
+            args="free",
+            space="space?",
+        ),
+        "SemilinearSDE": row(
+            nb.SemilinearSDE,
+            linear=("array", -np.ones(2)),
+            nonlinearity=("function", drift),
+            diffusion=("free", 0.5),
             args="free",
             space="space?",
         ),
@@ -268,8 +286,8 @@ def table() -> dict[str, Row]:
             kwargs="free",
         ),
         # guides and bridges
-        "FrozenGuide": row(nb.FrozenGuide, auxiliary=("linear?", OU)),
-        "RecedingGuide": row(nb.RecedingGuide, end_weight=("number", 0.5)),
+        "FrozenGuide": row(nb.FrozenGuide, auxiliary="linear?", rounds=("count from 0", 1)),
+        "RecedingGuide": row(nb.RecedingGuide, end_weight=("number", 0.5), rounds=("count from 0", 1)),
         "GeodesicGuide": row(nb.GeodesicGuide, correction=("number", 0.5), end_weight=("number", 0.5)),
         "DriftGuide": row(nb.DriftGuide, guide=("guide", nb.FrozenGuide())),
         "ScoreGuide": row(
@@ -834,6 +852,9 @@ EXTENSION = {
     ),
     *(
         "plan",
+        "prepared",
+        "parameters",
+        "functions",
         "auxiliary_process",
         "drift",
         "noise",

@@ -446,6 +446,7 @@ SPACES = {
     "BrownianMotion": lambda space: nb.BrownianMotion(0.5, space=space),
     "LinearSDE": lambda space: nb.LinearSDE(-1.0, 0.5, space=space),
     "SDE": lambda space: nb.SDE(ZERO, lambda t, x, args: 0.5, space=space),
+    "SemilinearSDE": lambda space: nb.SemilinearSDE(-1.0, ZERO, 0.5, space=space),
 }
 
 

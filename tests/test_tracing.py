@@ -114,7 +114,7 @@ def spread_by(kernel):
 def among(space):
     """Of a space: that of a flow, of a match, and of a curve."""
     x = start(space)
-    flow = nb.KunitaFlow(space, KERNEL, noise=nb.GridNoise(-2.0, 2.0, 3))
+    flow = nb.KunitaFlow(space, KERNEL, noise=nb.GridNoise(-9.0, 9.0, 9))
     condition = nb.InexactMatch(0.05, space=space).at(space.from_points(space.evaluate(2 * x, space.grid)))
     return factor_of(flow, x) + weight(nb.LinearSDE(-0.3, 0.4), condition, x)
 
@@ -157,6 +157,12 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
     ),
     "LinearSDE, matrices": (nb.LinearSDE, {"drift": times(Q), "diffusion": times(R), "shift": times(X0)}, stepped),
     "LinearSDE, constants": (nb.LinearSDE, {"drift": Q, "diffusion": [0.4, 0.2, 0.3], "shift": times(0.1)}, stepped),
+    "SemilinearSDE": (
+        nb.SemilinearSDE,
+        {"linear": times([-0.5, 0.0, 0.3]), "nonlinearity": lambda t, x, args: args * jnp.sin(x), "args": times(0.6)}
+        | {"diffusion": times(0.4), "space": POINTS},
+        weight,
+    ),
     "BrownianMotion": (nb.BrownianMotion, {"covariance": times(Q @ Q.T), "space": POINTS}, weight),
     "KunitaFlow": (
         nb.KunitaFlow,
@@ -188,6 +194,9 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
     ),
     "Landmarks": (nb.Landmarks, {"num_points": 3, "dim": 2, "weights": times(W)}, among),
     "FourierBasis": (nb.FourierBasis, {"num_modes": 1, "dim": 2, "num_quadrature": 5}, among),
+    "SineBasis": (nb.SineBasis, {"num_modes": 3, "dim": 2, "length": 2.0, "num_quadrature": 5}, among),
+    "CosineBasis": (nb.CosineBasis, {"num_modes": 2, "dim": 2, "length": 2.0, "num_quadrature": 5}, among),
+    "FourierSquare": (nb.FourierSquare, {"num_modes": 1, "dim": 2, "num_quadrature": 4}, among),
     "ExactMatch": (nb.ExactMatch, {"operator": times(PAIR)}, seen_by(PAIR @ SEEN)),
     "ExactMatch, constant": (nb.ExactMatch, {"operator": PICK}, seen_by(PICK @ SEEN)),
     "ExactMatch, mask": (nb.ExactMatch, {"mask": MASK}, site_of(SEEN[MASK])),
@@ -249,8 +258,8 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
         {"lower": [[-INF, -INF], [0.1, 0.3]], "upper": [[INF, INF], [0.2, 0.3]]},
         lambda box: weight(condition=box),
     ),
-    "FrozenGuide": (nb.FrozenGuide, {"auxiliary": Of(lambda t: nb.LinearSDE(-0.3 * t, 0.4))}, led_by),
-    "RecedingGuide": (nb.RecedingGuide, {"end_weight": times(0.3)}, led_by),
+    "FrozenGuide": (nb.FrozenGuide, {"auxiliary": Of(lambda t: nb.LinearSDE(-0.3 * t, 0.4)), "rounds": 0}, led_by),
+    "RecedingGuide": (nb.RecedingGuide, {"end_weight": times(0.3), "rounds": 1}, led_by),
     "GeodesicGuide": (nb.GeodesicGuide, {"correction": times(0.6), "end_weight": times(0.3)}, led_by),
     "DriftGuide": (nb.DriftGuide, {"guide": Of(lambda t: nb.RecedingGuide(0.3 * t))}, led_by),
     "ScoreGuide": (nb.ScoreGuide, LEARNED | {"history": {}, "held": network}, led_by),

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from .._checks import as_float, require
 from .._linalg import apply, cholesky, filled, solve_lower, transpose, without_variance
 from .._types import State, Structured
-from ..sdes import AbstractSDE
+from ..sdes import AbstractSDE, SemilinearSDE
 from ._few_noises import LowRank
 from ._guides import AbstractGuide, AbstractPlan, FrozenGuide, RecedingGuide, RecedingPlan, per_time
 
@@ -127,9 +127,11 @@ def _solver(covariance: Structured | LowRank) -> Callable[[State], State]:
 def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:
     """`FrozenGuide()` where a is constant, `GeodesicGuide()` for a flow, `RecedingGuide()` elsewhere.
 
-    With a drift, geodesics are no better than the linearised drift; with a strong one they are worse.
+    With a drift, geodesics are no better than the linearised drift; with a strong one they are worse. A semilinear
+    equation is linearised along a path, in two rounds.
     """
+    rounds = 2 if isinstance(sde, SemilinearSDE) else 0
     if sde.has_constant_covariance(x):
-        return FrozenGuide()
+        return FrozenGuide(rounds=rounds)
     operator = jax.eval_shape(lambda: sde.linearised_drift(jnp.zeros((), x.dtype), x)[0])
-    return GeodesicGuide() if operator.ndim == 0 else RecedingGuide()
+    return GeodesicGuide() if operator.ndim == 0 and rounds == 0 else RecedingGuide(rounds=rounds)

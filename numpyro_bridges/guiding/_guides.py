@@ -16,9 +16,20 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from .._checks import as_float, known, require, require_instance
-from .._linalg import add, apply, compose, congruence, promote, safe_sqrt, semidefinite_cholesky, varying_like
+from .._checks import as_float, known, positive_integer, require, require_instance
+from .._linalg import (
+    add,
+    apply,
+    compose,
+    congruence,
+    promote,
+    rows,
+    safe_sqrt,
+    semidefinite_cholesky,
+    varying_like,
+)
 from .._types import RealScalar, State, Structured
 from ..conditioning import GaussianMessage, Observation
 from ..sdes import AbstractSDE, AffineStep, BrownianMotion, Displaced, LinearSDE, Transition
@@ -69,6 +80,12 @@ class AbstractGuide(eqx.Module):
         """
         return False
 
+    def prepared(
+        self, sde: Displaced, seen: Observation, observed: State, reference: State, ts, start: State
+    ) -> "AbstractGuide":
+        """The guide for paths from `start`, a displacement too, to what is observed, which `plan` is not told."""
+        return self
+
     def follows(self, sde: Displaced, seen: Observation, reference: State) -> bool:
         """Whether its covariances follow the state, that of what comes after the end too.
 
@@ -108,22 +125,36 @@ class _FrozenPlan(AbstractPlan):
 class FrozenGuide(AbstractGuide):
     """The backward filter of one linear auxiliary process, computed once per parameter value.
 
-    **Arguments:** `auxiliary`: a `LinearSDE` or `BrownianMotion`; by default the SDE linearised at the observed end.
+    **Arguments:**
+
+    - `auxiliary`: a `LinearSDE` or `BrownianMotion`; by default the SDE itself, linearised.
+    - `rounds`: how often it is linearised along a path. With 0 it is linearised at the observed end, for all times.
+      The first round has the straight line from the start to the end, each further one the path that the guide of the
+      round before leads without noise. Two are the default of a `SemilinearSDE`, and worth a trial wherever a drift is
+      not linear: they help where the conditioned process stays near one path, and harm where it may cross an obstacle
+      at any time. A diffrax `solver` knows no rounds.
 
     The auxiliary process is stepped by the SDE's own scheme, so that an auxiliary process equal to the SDE gives the
     same log weight for every noise. Schauer, van der Meulen and van Zanten (2017); Mider, Schauer and van der
-    Meulen (2021).
+    Meulen (2021). Rounds are those of the iterated extended Kalman smoother (Bell 1994).
     """
 
     auxiliary: AbstractSDE | None
+    rounds: int = eqx.field(static=True)
+    way: "Way | None"
 
-    def __init__(self, auxiliary: AbstractSDE | None = None):
+    def __init__(self, auxiliary: AbstractSDE | None = None, *, rounds: int = 0):
         require(
             auxiliary is None or isinstance(auxiliary, (LinearSDE, BrownianMotion)),
             f"`auxiliary` must be a LinearSDE or a BrownianMotion, whose messages are Gaussian; "
             f"got {type(auxiliary).__name__}.",
         )
-        self.auxiliary = auxiliary
+        self.rounds = positive_integer(rounds, "rounds", least=0)
+        require(
+            auxiliary is None or self.rounds == 0,
+            f"`rounds` linearise the SDE itself, and `auxiliary` is linear; got rounds={rounds}. Give one of the two.",
+        )
+        self.auxiliary, self.way = auxiliary, None
 
     def check(self, sde, x):
         if self.auxiliary is not None:
@@ -134,7 +165,10 @@ class FrozenGuide(AbstractGuide):
 
     @property
     def moves(self):
-        return self.auxiliary is None
+        return self.auxiliary is None and self.rounds == 0
+
+    def prepared(self, sde, seen, observed, reference, ts, start):
+        return smoothed(self, sde, seen, observed, reference, ts, start)
 
     def plan(self, sde, seen, reference, ts, steps: AffineStep | None = None):
         steps = self.steps(sde, reference, ts) if steps is None else steps
@@ -144,13 +178,75 @@ class FrozenGuide(AbstractGuide):
         """The steps of the auxiliary process, of which a plan may be told if they are known."""
         auxiliary = self.auxiliary
         if auxiliary is None:
-            return jax.vmap(lambda s, t: sde.linearised_step(s, t, reference))(ts[:-1], ts[1:])
+            return linearised_steps(sde, reference, ts, self.way)
         return jax.vmap(lambda s, t: sde.auxiliary_step(auxiliary, s, t, reference))(ts[:-1], ts[1:])
 
     def auxiliary_process(self, sde, reference, t1):
+        require(
+            self.rounds == 0,
+            f"`rounds` of a guide change what is linear at every step, and the continuous weight (a diffrax `solver`) "
+            f"needs one linear process; got rounds={self.rounds}. Use `guide=FrozenGuide()`.",
+        )
         process = sde if self.auxiliary is None else sde.alongside(self.auxiliary)
         B, beta = process.linearised_drift(t1, reference)
         return LinearSDE(B, process.diffusion(t1, reference), beta)
+
+
+class Way(NamedTuple):
+    """States near which a process is linearised, displacements, at the starts of steps."""
+
+    ts: Array
+    states: State
+
+    def at(self, ts) -> State:
+        """The states at other times, by linear interpolation."""
+        after = jnp.clip(jnp.searchsorted(self.ts, ts, side="right"), 1, len(self.ts) - 1)
+        before = self.ts[after - 1]
+        length = self.ts[after] - before
+        part = jnp.clip((ts - before) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
+        first, second = self.states[after - 1], self.states[after]
+        return first + rows(part, first) * (second - first)
+
+
+def linearised_steps(sde: Displaced, reference: State, ts, way: Way | None) -> AffineStep:
+    """The steps of an SDE, linearised at one state or along a way."""
+    if way is None:
+        return jax.vmap(lambda s, t: sde.linearised_step(s, t, reference))(ts[:-1], ts[1:])
+    return jax.vmap(sde.linearised_step)(ts[:-1], ts[1:], way.at(ts[:-1]))
+
+
+def smoothed(guide, sde: Displaced, seen: Observation, observed: State, reference: State, ts, start: State):
+    """A guide of some `rounds` with the way of its last one, a path that is led without noise.
+
+    A path that is lost, numbers that are not finite, leaves the way as it was.
+    """
+    if guide.rounds == 0:
+        return guide
+    ts = jnp.asarray(ts)
+    duration = ts[-1] - ts[0]
+    part = ((ts[:-1] - ts[0]) / jnp.where(duration > 0, duration, 1.0)).astype(start.dtype)
+    line = start[None] + rows(part, start[None]) * (reference - start)[None]
+
+    def along(states):
+        return eqx.tree_at(lambda g: g.way, guide, Way(ts[:-1], states), is_leaf=lambda leaf: leaf is None)
+
+    def another_round(states, _):
+        plan = along(states).plan(sde, seen, reference, ts)
+
+        def step(y, inputs):
+            s, t, entry = inputs
+            transition = sde.transition(s, t, y)
+            steering = plan.steer(entry, transition, t - s, y, observed)
+            return transition.mean + apply(transition.factor, steering.mean()), y
+
+        ends = jax.tree.map(lambda a: a[1:], plan.steps)
+        last, path = jax.lax.scan(step, start, (ts[:-2], ts[1:-1], ends))
+        path = jnp.concatenate([path, last[None]])
+        return jnp.where(jnp.all(jnp.isfinite(path)), path, states), None
+
+    line = varying_like(line, sde, seen, observed, ts)
+    states, _ = jax.lax.scan(another_round, line, None, length=guide.rounds - 1)
+    return along(states)
 
 
 class RecedingPlan(AbstractPlan):
@@ -196,14 +292,19 @@ class RecedingGuide(AbstractGuide):
     The time left after step k is bridged by ã = a(x_k), the drift linearised at the observed end. Worth several nats in
     the spread of the log weight where a depends strongly on the state. Where a is constant this is `FrozenGuide`.
 
-    **Arguments:** `end_weight`: ã = (1 − end_weight) a(x_k) + end_weight a(reference). 0.2 helps on easy targets and
-    harms on hard ones.
+    **Arguments:**
+
+    - `end_weight`: ã = (1 − end_weight) a(x_k) + end_weight a(reference). 0.2 helps on easy targets and harms on hard
+      ones.
+    - `rounds`: as for `FrozenGuide`: how often the drift is linearised along a path.
     """
 
     end_weight: Structured | None
     """`None` for a weight of 0 that is known."""
+    rounds: int = eqx.field(static=True)
+    way: Way | None
 
-    def __init__(self, end_weight=0.0):
+    def __init__(self, end_weight=0.0, *, rounds: int = 0):
         value = known(end_weight, "end_weight")
         weight = as_float(end_weight, "end_weight")
         require(
@@ -211,10 +312,14 @@ class RecedingGuide(AbstractGuide):
             f"`end_weight` must be a number from 0 to 1; got {end_weight}.",
         )
         self.end_weight = None if value is not None and value == 0 else weight
+        self.rounds, self.way = positive_integer(rounds, "rounds", least=0), None
 
     @property
     def moves(self):
-        return True
+        return self.rounds == 0
+
+    def prepared(self, sde, seen, observed, reference, ts, start):
+        return smoothed(self, sde, seen, observed, reference, ts, start)
 
     def follows(self, sde, seen, reference):
         if sde.has_constant_covariance(reference):
@@ -224,13 +329,14 @@ class RecedingGuide(AbstractGuide):
 
     def plan(self, sde, seen, reference, ts, beyond=0.0):
         if sde.has_constant_covariance(reference):
-            return FrozenGuide().plan(sde, seen, reference, ts)
-        steps = jax.vmap(lambda s, t: sde.linearised_step(s, t, reference))(ts[:-1], ts[1:])
+            return FrozenGuide().plan(sde, seen, reference, ts, linearised_steps(sde, reference, ts, self.way))
+        steps = linearised_steps(sde, reference, ts, self.way)
         operator, shift = steps.operator, steps.shift
         n, ndim = reference.shape[0], operator.ndim - 1
         if ndim == 2 and n > _MAX_DENSE:
             kept = jnp.diagonal(operator, axis1=1, axis2=2)
-            shift = shift + jax.vmap(lambda full, d: full @ reference - apply(d, reference))(operator, kept)
+            near = jnp.broadcast_to(reference, shift.shape) if self.way is None else self.way.at(ts[:-1])
+            shift = shift + jax.vmap(lambda full, d, y: full @ y - apply(d, y))(operator, kept, near)
             operator, ndim = kept, 1
 
         def back(carry, inputs):
@@ -275,6 +381,9 @@ class DriftGuide(AbstractGuide):
 
     def closed(self, sde, x, ts):
         return DriftGuide(self.guide.closed(sde, x, ts))
+
+    def prepared(self, sde, seen, observed, reference, ts, start):
+        return DriftGuide(self.guide.prepared(sde, seen, observed, reference, ts, start))
 
     def plan(self, sde, seen, reference, ts):
         plan = self.guide.plan(sde, seen, reference, ts)

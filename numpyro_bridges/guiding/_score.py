@@ -129,6 +129,11 @@ class ScoreGuide(AbstractGuide):
         object.__setattr__(closed, "programs", (network, context))
         return closed
 
+    def prepared(self, sde, seen, observed, reference, ts, start):
+        prepared = replace(self, guide=self.guide.prepared(sde, seen, observed, reference, ts, start))
+        object.__setattr__(prepared, "programs", self.programs)
+        return prepared
+
     def plan(self, sde, seen, reference, ts):
         network, context = self.programs
         base = self.guide.plan(sde, seen, reference, ts)

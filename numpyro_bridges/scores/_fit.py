@@ -26,7 +26,7 @@ from .._linalg import apply, full_precision
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractCondition
-from ..guiding import AbstractGuide, FrozenGuide, ScoreGuide, Standard, Unguided, default_guide
+from ..guiding import AbstractGuide, FrozenGuide, ScoreGuide, ScorePlan, Standard, Unguided, default_guide
 from ..sdes import AbstractSDE, BrownianMotion
 from ..spaces import Landmarks
 from ._clouds import Cloud, adjoint_cloud, ends, forward_cloud, reversal_cloud, reversed_bridge, whiten
@@ -313,8 +313,11 @@ def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
         key_draw, key_cloud = jr.split(key)
         bridge = problem.draw(key_draw)
         cloud = make(bridge, key_cloud, -(-size // draws), rho)
-        frame, condition, seen, reference, ts = bridge.with_guide(problem.guide).problem()
-        plan = replace(problem.guide, network=network).plan(frame.sde, seen, reference, ts)
+        guide = replace(problem.guide, network=network)
+        led = bridge.with_guide(guide).problem()
+        frame, condition, seen, reference, ts = led
+        plan = bridge.plan(guide, led)
+        assert isinstance(plan, ScorePlan)
         observed = bridge.observed() - apply(seen.operator, frame.origins[-1])
         displacements = cloud.x - frame.origins[:-1, None]
 

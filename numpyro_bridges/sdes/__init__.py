@@ -18,4 +18,5 @@ from ._noise import (
     SpectralNoise as SpectralNoise,
 )
 from ._sde import SDE as SDE
+from ._semilinear import SemilinearSDE as SemilinearSDE
 from ._simulate import simulate as simulate

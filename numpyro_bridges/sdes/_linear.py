@@ -1,11 +1,8 @@
 """Linear SDEs, stepped by their exact law.
 
     dX = (B X + β) dt + σ dW:   X_{t+τ} | X_t ~ N(e^{Bτ} X_t + ∫₀^τ e^{Bu} β du,  ∫₀^τ e^{Bu} σσᵀ e^{Bᵀu} du)
-
-The integrals are elementwise for a scalar or diagonal B, and by series and doubling otherwise.
 """
 
-from math import factorial
 from typing import ClassVar
 
 import equinox as eqx
@@ -14,80 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import as_float, concrete, require, require_finite
-from .._linalg import (
-    add,
-    apply,
-    compose,
-    congruence,
-    product,
-    promote,
-    semidefinite_cholesky,
-    symmetric,
-    transpose,
-    varying_like,
-)
+from .._linalg import add, apply, compose, semidefinite_cholesky, symmetric, transpose
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
 from ._base import AbstractSDE, AffineStep, Frame, Transition, as_state_shift, require_space
-
-_TERMS, _DOUBLINGS = 22, 20
-"""Of the series, at a norm of at most 1, and of the step: B dt up to 2^20."""
-
-
-def _phi1(x: Array) -> Array:
-    """φ₁(x) = (eˣ − 1)/x = ∫₀¹ e^{sx} ds, with its derivatives of every order.
-
-    Those of the quotient lose their digits near 0, at 0 half their value; within 1 the series Σ xⁿ/(n + 1)! has them.
-    """
-    near = jnp.abs(x) < 1
-    small, large = jnp.where(near, x, 0.0), jnp.where(near, 1.0, x)
-    series = jnp.zeros_like(x)
-    for n in reversed(range(_TERMS)):
-        series = series * small + 1 / factorial(n + 1)
-    return jnp.where(near, series, jnp.expm1(large) / large)
-
-
-def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array, Array, Array]:
-    """e^{Bτ} − 1, ∫₀^τ e^{Bu} β du and ∫₀^τ e^{Bu} a e^{Bᵀu} du at τ = dt: Taylor series at dt/2^k, then k doublings.
-
-    The block exponential of Van Loan (1978) holds e^{−Bτ} beside e^{Bτ} and loses the covariance of a stiff equation to
-    cancellation, 0.1 at Bτ = 40; a doubling is a sum of covariances. To double e^{Bτ} − 1 keeps the digits that e^{Bτ}
-    would lose in small steps. NaN where Bτ is beyond 2^20.
-    """
-    one = jnp.ones((), B.dtype)
-    norm = jnp.max(jnp.sum(jnp.abs(B), axis=0)) * dt
-    k = jnp.ceil(jnp.log2(jnp.maximum(jax.lax.stop_gradient(norm), one)))
-    A, beta, a = B * (dt * 2.0**-k), beta * (dt * 2.0**-k), a * (dt * 2.0**-k)
-
-    def series(carry, j):
-        power, term, terms, totals = carry
-        power, term = product(A, power) / j, product(A, term) / (j + 1)
-        rate = product(A, terms) / (j + 1)
-        terms = rate + rate.T
-        E, shift, S = totals
-        return (power, term, terms, (E + power, shift + term, S + terms)), None
-
-    start = (jnp.eye(B.shape[0], dtype=B.dtype), beta, a, (jnp.zeros_like(B), beta, a))
-    start = varying_like(start, B, beta, a, dt)
-    (*_, totals), _ = jax.lax.scan(series, start, jnp.arange(1, _TERMS + 1, dtype=B.dtype))
-
-    def double(totals, i):
-        E, shift, S = totals
-        ES = product(E, S)
-        doubled = (2 * E + product(E, E), 2 * shift + product(E, shift), 2 * S + ES + ES.T + product(ES, E.T))
-        return jax.tree.map(lambda new, old: jnp.where(i < k, new, old), doubled, totals), None
-
-    (E, shift, S), _ = jax.lax.scan(double, totals, jnp.arange(_DOUBLINGS, dtype=B.dtype))
-    return jax.tree.map(lambda x: jnp.where(k <= _DOUBLINGS, x, jnp.nan), (E, shift, S))
-
-
-def _psd_cholesky(S: Structured) -> Structured:
-    """Cholesky factor of a covariance that may be singular: a nugget of a few rounding errors per diagonal entry."""
-    if S.ndim < 2:
-        return semidefinite_cholesky(S)
-    d = jnp.diagonal(S)
-    eps = jnp.finfo(S.dtype).eps
-    return semidefinite_cholesky(S + jnp.diag(4 * eps * d + 1e-24 * jnp.max(d)))
+from ._exponential import exponential_noise_size, exponential_transition, flow
 
 
 class BrownianMotion(AbstractSDE):
@@ -197,34 +125,15 @@ class LinearSDE(AbstractSDE):
     def is_autonomous(self, x: State) -> bool:
         return True
 
-    def _flow(self, dt: RealScalar, x: State) -> tuple[Structured, State, Structured]:
-        """e^{B dt} − 1, ∫ e^{Bu} β du and the covariance."""
-        B, sigma, beta = self.drift_operator, self.diffusion_operator, as_state_shift(self.shift, x)
-        a = compose(sigma, transpose(sigma))
-        if B.ndim < 2:
-            rate = B if a.ndim < 2 or B.ndim == 0 else 0.5 * (B[:, None] + B[None, :])
-            mean_map = dt * _phi1(dt * B)
-            return mean_map * B, apply(mean_map, beta), dt * _phi1(2 * dt * rate) * a
-        a = promote(a, 2, B.shape[0])
-        growth, shift, S = _affine_flow(B, beta if beta.ndim == 2 else beta[:, None], a, dt)
-        return growth, shift.reshape(beta.shape), 0.5 * (S + S.T)
-
     def exact_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
         """The exact affine Gaussian law of X at t1 given X at t0, for states shaped like x."""
-        growth, shift, S = self._flow(t1 - t0, x)
+        shift = as_state_shift(self.shift, x)
+        growth, shift, S = flow(self.drift_operator, shift, self.covariance(t0, x), t1 - t0)
         return AffineStep(add(jnp.ones((), x.dtype), growth), shift, S)
 
     def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
-        dt = t1 - t0
-        growth, shift, S = self._flow(dt, x)
-        increment = apply(growth, x) + shift
-        B, sigma = self.drift_operator, self.diffusion_operator
-        if B.ndim == 0 or (B.ndim == 1 and sigma.ndim < 2):
-            # σ times a positive number, smooth also where σ is 0, as a root of σ² is not
-            factor = compose(jnp.sqrt(dt * _phi1(2 * dt * B)), sigma)
-            return Transition(x, increment, factor, S)
-        factor = _psd_cholesky(S)
-        return Transition(x, increment, factor, congruence(factor, jnp.ones((), x.dtype)))
+        shift = as_state_shift(self.shift, x)
+        return exponential_transition(self.drift_operator, shift, self.noise(t0, x), t1 - t0, x)
 
     def _displaced(self, drift: State) -> "LinearSDE":
         """The process seen from an origin where it has this drift."""
@@ -242,9 +151,11 @@ class LinearSDE(AbstractSDE):
         from where it is conditioned to go.
         """
 
+        none = jnp.zeros((), x0.dtype)
+
         def moved(t):
             """How far the noise-free path has come."""
-            growth, shift, _ = self._flow(t, x0)
+            growth, shift, _ = flow(self.drift_operator, as_state_shift(self.shift, x0), none, t)
             return apply(growth, x0) + shift
 
         way = end - x0
@@ -263,8 +174,7 @@ class LinearSDE(AbstractSDE):
         return auxiliary.linearised_step(t0, t1, x)
 
     def noise_size(self, x: State) -> int:
-        sigma = self.diffusion_operator
-        return sigma.shape[1] if sigma.ndim == 2 and self.drift_operator.ndim == 0 else x.shape[0]
+        return exponential_noise_size(self.drift_operator, self.diffusion_operator.shape, x)
 
 
 def as_covariance(value, name: str) -> Array:

@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable
 from contextlib import contextmanager
 from copy import copy
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -63,7 +63,68 @@ class _Coefficient(eqx.Module):
         return jnp.asarray(floating(value, f"{self.name}(t, x, args)"), x.dtype)
 
 
-class SDE(AbstractSDE):
+class FunctionSDE(AbstractSDE):
+    """An SDE two of whose coefficients are a user's functions f(t, x, args): `diffusion`, and one that pulls."""
+
+    diffusion_function: Any
+    args: Any
+    space: AbstractSpace | None
+    programs: tuple[Closed, Closed] | None
+    pull: eqx.AbstractClassVar[str]
+    """Name of the one that pulls; the field is called so, with `_function` behind."""
+
+    def __init__(self, pull: Callable, diffusion: Any, args: Any, space: AbstractSpace | None):
+        for name, f in ((self.pull, pull), ("diffusion", diffusion)):
+            if not callable(f):
+                raise ValueError(
+                    f"`{name}` must be a function f(t, x, args); got {f!r}. Wrap it: `lambda t, x, args: ...`."
+                )
+            require(
+                _takes_three(f),
+                f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add those it does without.",
+            )
+        setattr(self, f"{self.pull}_function", _wrapped(pull))
+        self.diffusion_function = _wrapped(diffusion)
+        self.args = jax.tree.map(lambda leaf: _parameter(leaf), args)
+        require_space(space)
+        self.space = space
+        self.programs = None
+
+    def closed(self, t: RealScalar, x: State) -> Self:
+        if self.programs is not None:
+            return self
+        closed = copy(self)
+        programs = []
+        for name in (self.pull, "diffusion"):
+            field = f"{name}_function"
+            function = getattr(self, field)
+            own = function if isinstance(function, _Static) else None
+            kept = None if own is function else function
+            with _no_escape(name):
+                programs.append(close(_Coefficient(name, own), kept, t, x, self.args))
+            object.__setattr__(closed, field, kept)
+        object.__setattr__(closed, "programs", tuple(programs))
+        return closed
+
+    def pulled(self, t: RealScalar, x: State) -> State:
+        """The coefficient that pulls, at (t, x)."""
+        coefficient = _Coefficient(self.pull, None) if self.programs is None else self.programs[0]
+        return coefficient(getattr(self, f"{self.pull}_function"), t, x, self.args)
+
+    def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
+        diffusion = _Coefficient("diffusion", None) if self.programs is None else self.programs[1]
+        sigma = diffusion(self.diffusion_function, t, x, self.args)
+        require(
+            sigma.ndim <= 2,
+            f"`diffusion` must return a scalar, a diagonal (n,) or a matrix (n, k); got shape {sigma.shape}.",
+        )
+        return sigma, compose(sigma, transpose(sigma))
+
+    def has_constant_covariance(self, x: State) -> bool:
+        return not depends_on(lambda t, y: self.noise(t, y)[0], x, 1)
+
+
+class SDE(FunctionSDE):
     """dX = drift(t, X, args) dt + diffusion(t, X, args) dW, stepped by Euler–Maruyama.
 
     **Arguments:**
@@ -80,57 +141,13 @@ class SDE(AbstractSDE):
     """
 
     drift_function: Any
-    diffusion_function: Any
-    args: Any
-    space: AbstractSpace | None
-    programs: tuple[Closed, Closed] | None
+    pull: ClassVar[str] = "drift"
 
     def __init__(self, drift: Callable, diffusion: Callable, args: Any = None, *, space: AbstractSpace | None = None):
-        for name, f in (("drift", drift), ("diffusion", diffusion)):
-            if not callable(f):
-                raise ValueError(
-                    f"`{name}` must be a function f(t, x, args); got {f!r}. Wrap it: `lambda t, x, args: ...`."
-                )
-            require(
-                _takes_three(f),
-                f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add those it does without.",
-            )
-        self.drift_function, self.diffusion_function = _wrapped(drift), _wrapped(diffusion)
-        self.args = jax.tree.map(lambda leaf: _parameter(leaf), args)
-        require_space(space)
-        self.space = space
-        self.programs = None
-
-    def closed(self, t: RealScalar, x: State) -> "SDE":
-        if self.programs is not None:
-            return self
-        closed = copy(self)
-        programs = []
-        for name, field in (("drift", "drift_function"), ("diffusion", "diffusion_function")):
-            function = getattr(self, field)
-            own = function if isinstance(function, _Static) else None
-            kept = None if own is function else function
-            with _no_escape(name):
-                programs.append(close(_Coefficient(name, own), kept, t, x, self.args))
-            object.__setattr__(closed, field, kept)
-        object.__setattr__(closed, "programs", tuple(programs))
-        return closed
+        super().__init__(drift, diffusion, args, space)
 
     def drift(self, t: RealScalar, x: State) -> State:
-        drift = _Coefficient("drift", None) if self.programs is None else self.programs[0]
-        return drift(self.drift_function, t, x, self.args)
-
-    def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
-        diffusion = _Coefficient("diffusion", None) if self.programs is None else self.programs[1]
-        sigma = diffusion(self.diffusion_function, t, x, self.args)
-        require(
-            sigma.ndim <= 2,
-            f"`diffusion` must return a scalar, a diagonal (n,) or a matrix (n, k); got shape {sigma.shape}.",
-        )
-        return sigma, compose(sigma, transpose(sigma))
-
-    def has_constant_covariance(self, x: State) -> bool:
-        return not depends_on(lambda t, y: self.noise(t, y)[0], x, 1)
+        return self.pulled(t, x)
 
 
 def _parameter(leaf: Any) -> jax.Array:

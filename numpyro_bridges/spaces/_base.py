@@ -1,8 +1,8 @@
-"""What a space is: a finite set of functions on the circle, and the norm in which curves are compared.
+"""What a space is: a finite set of functions on a domain, and the norm in which curves and fields are compared.
 
-A closed curve s ↦ x(s) in R^dim, s in [0, 2π), is held as a state of n rows x_i in R^dim,
+A function s ↦ x(s) in R^dim, such as a closed curve with s in [0, 2π), is held as a state of n rows x_i in R^dim,
 
-    x(s) = Σ_i φ_i(s) x_i,    ‖x‖² = Σ_i w_i |x_i|² ≈ ∫ |x(s)|² ds / 2π      (the H-norm).
+    x(s) = Σ_i φ_i(s) x_i,    ‖x‖² = Σ_i w_i |x_i|² ≈ ∫ |x(s)|² ds / ∫ ds      (the H-norm).
 """
 
 from abc import abstractmethod
@@ -13,11 +13,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import floating, require, require_finite, require_instance
-from .._linalg import safe_sqrt
+from .._linalg import as_columns, rows, safe_sqrt
 
 
 class AbstractSpace(eqx.Module):
-    """Closed curves in R^dim, discretised. Everything is written for one state, (size, dim)."""
+    """Functions with values in R^dim, discretised. Everything is written for one state, (size, dim).
+
+    A state of values in R may be a vector, (size,), and then so are its points.
+    """
 
     dim: eqx.AbstractVar[int]
     weights: eqx.AbstractVar[Float[Array, " n"]]
@@ -30,21 +33,25 @@ class AbstractSpace(eqx.Module):
     @property
     @abstractmethod
     def grid(self) -> np.ndarray:
-        """The q parameters s at which fields along the curve are evaluated, equispaced."""
+        """The q parameters s at which fields along the curve are evaluated, evenly spread."""
+
+    @abstractmethod
+    def parameters(self, count: int) -> np.ndarray:
+        """So many parameters, evenly spread over the domain: those of points that are given without."""
 
     @abstractmethod
     def basis(self, s: ArrayLike) -> Float[Array, "m n"]:
         """The values φ_i(s_j), one column for each function."""
 
     @abstractmethod
-    def to_points(self, x: Float[Array, "n dim"]) -> Float[Array, "q dim"]:
+    def to_points(self, x: Float[Array, "n *dim"]) -> Float[Array, "q *dim"]:
         """The points of the curve at the parameters `grid`."""
 
     @abstractmethod
     def from_points(self, values: Float[Array, "q ..."]) -> Float[Array, "n ..."]:
         """The coefficients of a field from its values at the points; trailing axes are kept."""
 
-    def inner(self, x: Float[Array, "n dim"], y: Float[Array, "n dim"]) -> Float[Array, ""]:
+    def inner(self, x: Float[Array, "n *dim"], y: Float[Array, "n *dim"]) -> Float[Array, ""]:
         """⟨x, y⟩ = Σ_i w_i x_i · y_i."""
         x, y = self._state(x), self._state(y, "y")
         require(
@@ -52,48 +59,49 @@ class AbstractSpace(eqx.Module):
             f"`weights` must be of shape ({self.size},); got {jnp.shape(self.weights)}. For a batch of "
             "spaces, `jax.vmap` the function that uses them.",
         )
-        return jnp.sum(self.weights.astype(x.dtype)[:, None] * x * y)
+        return jnp.sum(rows(self.weights.astype(x.dtype), x) * x * y)
 
-    def squared_norm(self, x: Float[Array, "n dim"]) -> Float[Array, ""]:
+    def squared_norm(self, x: Float[Array, "n *dim"]) -> Float[Array, ""]:
         """‖x‖², smooth everywhere."""
         return self.inner(x, x)
 
-    def norm(self, x: Float[Array, "n dim"]) -> Float[Array, ""]:
+    def norm(self, x: Float[Array, "n *dim"]) -> Float[Array, ""]:
         """‖x‖. Its gradient at x = 0, where it has a corner, is taken as 0."""
         return safe_sqrt(self.squared_norm(x))
 
-    def evaluate(self, x: Float[Array, "n dim"], s: ArrayLike) -> Float[Array, "m dim"]:
+    def evaluate(self, x: Float[Array, "n *dim"], s: ArrayLike) -> Float[Array, "m *dim"]:
         """The points x(s_j) of the curve."""
         x = self._state(x)
         return jnp.matmul(self.basis(s).astype(x.dtype), x, precision="highest")
 
-    def project(self, values: Float[Array, "m dim"], s: ArrayLike | None = None) -> Float[Array, "n dim"]:
+    def project(self, values: Float[Array, "m *dim"], s: ArrayLike | None = None) -> Float[Array, "n *dim"]:
         """The curve of this space that is nearest to given points, by least squares.
 
         **Arguments:**
 
         - `values`: points of a curve, (m, dim), at least as many as a state has rows. (The curve through
             fewer landmarks is `refine` from their own space.)
-        - `s`: their parameters in [0, 2π), (m,); equispaced from 0 on if left out.
+        - `s`: their parameters, (m,); `parameters(m)` if left out, for curves equispaced from 0 on.
 
         **Returns:** the state; where the points leave it open (repeated parameters), the one of least norm.
         """
         values = floating(values, "values")
         require(
-            values.ndim == 2 and values.shape[1] == self.dim and values.shape[0] >= self.size,
+            self._fits(values.shape[1:]) and values.shape[0] >= self.size,
             f"`values` must be at least {self.size} points of dimension {self.dim}, one a row; got shape "
             f"{values.shape}. Fewer points become a curve by `refine` from `Landmarks` of their number; "
             "for a batch, use `jax.vmap`.",
         )
         require_finite(values, "values", "Missing points are left out, with `s` for those that are there.")
-        basis = self.basis(equispaced(values.shape[0]) if s is None else s)
+        basis = self.basis(self.parameters(values.shape[0]) if s is None else s)
         require(
             basis.shape[0] == values.shape[0],
             f"`s` must have one parameter for each of {values.shape[0]} points; got shape {basis.shape[:1]}.",
         )
-        return jnp.linalg.lstsq(basis.astype(values.dtype), values)[0]
+        found = jnp.linalg.lstsq(basis.astype(values.dtype), as_columns(values))[0]
+        return found.reshape(self.size, *values.shape[1:])
 
-    def refine(self, x: Float[Array, "n dim"], finer: "AbstractSpace") -> Float[Array, "m dim"]:
+    def refine(self, x: Float[Array, "n *dim"], finer: "AbstractSpace") -> Float[Array, "m *dim"]:
         """The same curve as a state of another space that is at least as fine, of either kind.
 
         A coarser space gets what its `from_points` makes of the curve: its points, or projected coefficients.
@@ -105,15 +113,19 @@ class AbstractSpace(eqx.Module):
         )
         return finer.from_points(self.evaluate(x, finer.grid))
 
-    def _state(self, x: ArrayLike, name: str = "x") -> Float[Array, "n dim"]:
+    def _state(self, x: ArrayLike, name: str = "x") -> Float[Array, "n *dim"]:
         """A state, or `ValueError`: one row too few would broadcast."""
         x = floating(x, name)
         require(
-            x.shape == (self.size, self.dim),
+            x.shape[:1] == (self.size,) and self._fits(x.shape[1:]),
             f"`{name}`, a state of this space, must have shape ({self.size}, {self.dim}); got {x.shape}. "
             "For a batch, use `jax.vmap`.",
         )
         return x
+
+    def _fits(self, trailing: tuple[int, ...]) -> bool:
+        """Whether values are in R^dim by their trailing axis, which those in R need not have."""
+        return trailing == (self.dim,) or (trailing == () and self.dim == 1)
 
     def _field(self, values: ArrayLike) -> Float[Array, "q ..."]:
         """The values of a field at the points of `grid`."""

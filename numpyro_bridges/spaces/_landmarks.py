@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import as_float, positive_integer, require, require_positive
 from ._base import AbstractSpace, equispaced
-from ._fourier import fourier_functions
+from ._basis import fourier_functions
 
 
 class Landmarks(AbstractSpace):
@@ -47,7 +47,10 @@ class Landmarks(AbstractSpace):
 
     @property
     def grid(self) -> np.ndarray:
-        return equispaced(self.num_points)
+        return self.parameters(self.num_points)
+
+    def parameters(self, count: int) -> np.ndarray:
+        return equispaced(count)
 
     def basis(self, s: ArrayLike) -> Float[Array, "m n"]:
         """Column i is the trigonometric interpolant of 1 at s_i and 0 at the other points."""

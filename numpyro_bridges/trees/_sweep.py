@@ -309,16 +309,22 @@ class TreeProblem(eqx.Module):
         ts = self._grid(branch.length, False)
         return jnp.concatenate([ts, ts[-1:]])
 
-    def _inner_plan(self, branch: Branch, seen: Observation, reference: State, *beyond) -> AbstractPlan:
+    def _inner_plan(self, branch: Branch, seen: Observation, observed: State, reference: State, *beyond):
         edge, ts = self._edge(branch), self._inner_grid(branch)
-        if isinstance(self.guide, FrozenGuide):
+        if branch.steps is not None:
+            assert isinstance(self.guide, FrozenGuide)
             return self.guide.plan(edge, seen, reference, ts, branch.steps)
-        return self.guide.plan(edge, seen, reference, ts, *beyond)
+        guide = self._prepared(branch, seen, observed, reference, ts)
+        return guide.plan(edge, seen, reference, ts, *beyond)
+
+    def _prepared(self, branch: Branch, seen: Observation, observed: State, reference: State, ts) -> AbstractGuide:
+        start = branch.parent_anchor - branch.anchor
+        return self.guide.prepared(self._edge(branch), seen, observed, reference, ts, start)
 
     def _with_steps(self, branches: Branch) -> Branch:
         """Inner branches with all that can be known before any message, in one program for all of them."""
         guide = self.guide
-        if not isinstance(guide, FrozenGuide):
+        if not isinstance(guide, FrozenGuide) or guide.rounds:
             return branches
         here = jnp.zeros_like(self.x0)
 
@@ -354,7 +360,8 @@ class TreeProblem(eqx.Module):
         ts = self._grid(branch.length, condition.exact)
         here = jnp.zeros_like(self.x0)
         reference = lift(seen.operator, here, observed) if self.follows else here
-        plan = self.guide.plan(self._edge(branch), seen, reference, ts)
+        guide = self._prepared(branch, seen, observed, reference, ts)
+        plan = guide.plan(self._edge(branch), seen, reference, ts)
         return Led(plan, seen, observed, ts)
 
     def up(self) -> UpwardPass:
@@ -376,7 +383,7 @@ class TreeProblem(eqx.Module):
 
         def joined(total, branch):
             seen, w, c = total.as_observation()
-            plan = self._inner_plan(branch, seen, jnp.zeros_like(self.x0))
+            plan = self._inner_plan(branch, seen, w, jnp.zeros_like(self.x0))
             message = self._start_message(plan, branch, w)
             return message._replace(c=message.c + c), (plan, w)
 
@@ -402,7 +409,7 @@ class TreeProblem(eqx.Module):
 
         def led(total, branch):
             seen, value, beyond, reference = as_seen(total, part.a, everything)
-            return self._inner_plan(branch, part.known(seen), part.lifted(reference), beyond), value
+            return self._inner_plan(branch, part.known(seen), value, part.lifted(reference), beyond), value
 
         # for each end the identity, or fewer directions than ever are seen
         everything = ends.seen.operator.ndim == 1 or part.basis is not None

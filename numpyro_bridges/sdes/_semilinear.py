@@ -1,0 +1,136 @@
+"""Semilinear SDEs: a linear operator that generates a semigroup, and what is not linear held over a step."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from .._checks import as_float, require, require_finite
+from .._linalg import add, apply, as_columns, columns
+from .._types import RealScalar, State, Structured
+from ..spaces import AbstractSpace
+from ._base import AbstractSDE, AffineStep, Transition, at_any_time
+from ._exponential import affine_step, exponential_noise_size, exponential_transition
+from ._sde import FunctionSDE
+
+_MAX_LINEARISED = 64
+"""Largest state, n · dim numbers, of which the nonlinearity has its full Jacobian; beyond, its diagonal."""
+
+
+class SemilinearSDE(FunctionSDE):
+    """dX = (A X + F(t, X)) dt + B(t, X) dW, stepped by exponential Euler.
+
+    x' = e^{A dt} x + ∫₀^dt e^{Au} du F(t, x) + N(0, ∫₀^dt e^{Au} B Bᵀ e^{Aᵀu} du), F and B held at the start of a step:
+    the exact law where F = 0 and B is constant, and stable however fast the modes of A decay, where a step of
+    Euler–Maruyama must be short beside the fastest. For a reaction–diffusion equation A is ν Δ,
+
+        space = FourierBasis(32, 1)
+        SemilinearSDE(0.1 * space.laplacian, lambda t, x, args: space.from_points(f(space.to_points(x))), sigma)
+
+    **Arguments:**
+
+    - `linear`: A, `()`, `(n,)` where it is diagonal in the basis of the states, or `(n, n)`.
+    - `nonlinearity`: F, `f(t, x, args)`, shaped like x, for t in [t0, t1].
+    - `diffusion`: B, an array, `()`, `(n,)` or `(n, k)`, or a function `f(t, x, args)` that returns one.
+    - `args`: the parameters of the functions, a pytree of arrays, as for `SDE`.
+    - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
+
+    Lord, Powell and Shardlow (2014), An Introduction to Computational Stochastic PDEs, section 10.8.
+    """
+
+    linear: Structured
+    nonlinearity_function: Any
+    pull: ClassVar[str] = "nonlinearity"
+
+    def __init__(
+        self,
+        linear: ArrayLike,
+        nonlinearity: Callable,
+        diffusion: ArrayLike | Callable,
+        args: Any = None,
+        *,
+        space: AbstractSpace | None = None,
+    ):
+        self.linear = as_float(linear, "linear")
+        shape = self.linear.shape
+        require(
+            len(shape) < 2 or shape == shape[:1] * 2,
+            f"`linear` must be a scalar, a diagonal (n,) or a square matrix (n, n); got shape {shape}. An operator "
+            "that the basis does not diagonalise is given as its matrix in the basis.",
+        )
+        require_finite(self.linear, "linear")
+        if not callable(diffusion):
+            diffusion = _Constant(as_float(diffusion, "diffusion"))
+            require_finite(diffusion.value, "diffusion")
+        super().__init__(nonlinearity, diffusion, args, space)
+
+    def drift(self, t: RealScalar, x: State) -> State:
+        return apply(self._generator(x), x) + self.pulled(t, x)
+
+    def _generator(self, x: State) -> Structured:
+        """A in the precision of the state."""
+        return self.linear.astype(x.dtype)
+
+    def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
+        return exponential_transition(self._generator(x), self.pulled(t0, x), self.noise(t0, x), t1 - t0, x)
+
+    def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
+        """A + F'(x) and β; of F' its diagonal for states of more than 64 numbers, so that a diagonal A stays one."""
+        slope, beta = self._linearised(t, x)
+        return add(self._generator(x), slope), beta
+
+    def linearised_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        slope, beta = self._linearised(t0, x)
+        return affine_step(self._generator(x), slope, beta, self.covariance(t0, x), t1 - t0)
+
+    def auxiliary_step(self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        B, beta = auxiliary.linearised_drift(t0, x)
+        A = self._generator(x)
+        return affine_step(A, add(B, -A), beta, auxiliary.covariance(t0, x), t1 - t0)
+
+    def noise_size(self, x: State) -> int:
+        return exponential_noise_size(self.linear, at_any_time(self.diffusion, x).shape, x)
+
+    def check_state(self, x: State) -> None:
+        n = x.shape[0]
+        require(
+            self.linear.ndim == 0 or self.linear.shape[0] == n,
+            f"`linear` must be a scalar, a diagonal ({n},) or a matrix ({n}, {n}) for a state {x.shape}; got shape "
+            f"{self.linear.shape}. A parameter with a batch axis does this too: vmap over it.",
+        )
+        pulled = at_any_time(self.pulled, x)
+        require(
+            pulled.shape == x.shape,
+            f"`nonlinearity` must return an array shaped like the state, {x.shape}; got {pulled.shape}. "
+            "A parameter with a batch axis does this too: vmap over it.",
+        )
+        super().check_state(x)
+
+    def _linearised(self, t: RealScalar, x: State) -> tuple[Structured, State]:
+        """F' and β with F(t, y) ≈ F' y + β near x; F' acts on the first axis, its mean over columns."""
+        value, along = jax.linearize(lambda y: self.pulled(t, y), x)
+        directions = jnp.arange(x.size)
+
+        def slopes(direction):
+            """How the columns of F change with one number of the state, in its own column alone."""
+            i, column = jnp.divmod(direction, columns(x))
+            moved = along(jnp.zeros_like(x).reshape(-1).at[direction].set(1.0).reshape(x.shape))
+            change = as_columns(moved)[:, column] / columns(x)
+            return change if x.size <= _MAX_LINEARISED else change[i]
+
+        found = jax.lax.map(slopes, directions, batch_size=_MAX_LINEARISED)
+        summed = jnp.sum(found.reshape(x.shape[0], columns(x), *found.shape[1:]), axis=1)
+        slope = summed.T  # (i, j) where j was moved
+        return slope, value - apply(slope, x)
+
+
+class _Constant(eqx.Module):
+    """A coefficient that is the same everywhere."""
+
+    value: Array
+
+    def __call__(self, t, x, args):
+        return self.value

@@ -1,0 +1,276 @@
+"""Functions by their coefficients in an orthonormal basis of eigenfunctions of the Laplacian."""
+
+from abc import abstractmethod
+from math import sqrt
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from .._checks import floating, known_number, positive_integer, require, require_finite
+from ._base import AbstractSpace, equispaced
+
+
+def waves(s: ArrayLike, frequencies: np.ndarray, ndim: int = 1) -> tuple[Any, Any, Any]:
+    """cos k s and sin k s, `(..., frequencies)`, and s.
+
+    In NumPy and double precision unless s is traced: single precision loses digits in cos ks for a large k.
+    """
+    converted = floating(s, "s")
+    traced = isinstance(converted, Tracer)
+    xp, s = (jnp, converted) if traced else (np, np.asarray(s, float))
+    what = "a vector of parameters" if ndim == 1 else "parameters (m, 2), a pair in each row"
+    good = s.ndim == ndim and (ndim == 1 or s.shape[1] == 2)
+    require(good, f"`s` must be {what}; got shape {s.shape}.")
+    require_finite(converted, "s")
+    angles = s[..., None] * xp.asarray(frequencies, s.dtype).reshape((1,) * ndim + (-1,))
+    return xp.cos(angles), xp.sin(angles), s
+
+
+def fourier_functions(s: ArrayLike, num_modes: int, ndim: int = 1) -> Any:
+    """1, √2 cos s, √2 sin s, √2 cos 2s, ... at s, `(..., 2 num_modes + 1)`."""
+    cosines, sines, s = waves(s, np.arange(1, num_modes + 1), ndim)
+    xp = np if isinstance(s, np.ndarray) else jnp
+    both: Any = xp.stack([cosines, sines], axis=-1).reshape(*cosines.shape[:-1], 2 * num_modes)
+    one: Any = xp.ones_like(s)
+    return xp.concatenate([one[..., None], sqrt(2) * both], axis=-1)
+
+
+class AbstractBasis(AbstractSpace):
+    """Functions by n coefficients in a basis that is orthonormal in L² of a domain of mass 1.
+
+    The H-norm is the Euclidean norm of the coefficients. Fields are evaluated at q points of the domain, `grid`: with Φ
+    the (q, n) values of the basis there, points are Φ x and the coefficients of a field f are Φᵀ f / q, Φᵀ Φ / q = I.
+    """
+
+    num_quadrature: eqx.AbstractVar[int]
+
+    @property
+    @abstractmethod
+    def laplacian(self) -> Float[Array, " n"]:
+        """The eigenvalues of the Laplacian, none of them positive: ν Δ is the diagonal `ν * space.laplacian`."""
+
+    @abstractmethod
+    def functions(self, s: ArrayLike) -> Any:
+        """The values φ_i(s_j), in NumPy unless s is traced."""
+
+    @property
+    def grid(self) -> np.ndarray:
+        return self.parameters(self.num_quadrature)
+
+    @property
+    def weights(self) -> Float[Array, " n"]:
+        """Ones: the basis is orthonormal."""
+        return jnp.ones(self.size)
+
+    def basis(self, s: ArrayLike) -> Float[Array, "m n"]:
+        return jnp.asarray(self.functions(s))
+
+    def to_points(self, x: Float[Array, "n *dim"]) -> Float[Array, "q *dim"]:
+        return self.evaluate(x, self.grid)
+
+    def from_points(self, values: Float[Array, "q ..."]) -> Float[Array, "n ..."]:
+        """Φᵀ f / q."""
+        values = self._field(values)
+        projection = self.functions(self.grid).T / len(self.grid)
+        return jnp.tensordot(jnp.asarray(projection, values.dtype), values, axes=1, precision="highest")
+
+    def _quadrature(self, num_quadrature: int | None, default: int, least: int, rule: str) -> int:
+        """The number of points, checked."""
+        count = positive_integer(default if num_quadrature is None else num_quadrature, "num_quadrature")
+        require(
+            count >= least,
+            f"`num_quadrature` must be at least {rule} = {least}, or the functions are not orthonormal on the grid; "
+            f"got {num_quadrature}.",
+        )
+        return count
+
+
+class FourierBasis(AbstractBasis):
+    """Closed curves of finite bandwidth, or periodic functions: coefficients of 2 num_modes + 1 functions in the order
+
+        1, √2 cos s, √2 sin s, √2 cos 2s, √2 sin 2s, ..., √2 cos ms, √2 sin ms      (m = num_modes),
+
+    s in [0, 2π), orthonormal in L²(ds / 2π). The q points are equispaced.
+
+    **Arguments:**
+
+    - `num_modes`: m, the highest frequency.
+    - `dim`: dimension of the space in which the curve lies; 1 for a function.
+    - `num_quadrature`: q, at least 2m + 1. With the default max(4m, 32) the coefficients of a field that is
+        quadratic in the curve are exact.
+    """
+
+    num_modes: int = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+    num_quadrature: int = eqx.field(static=True)
+
+    def __init__(self, num_modes: int, dim: int, *, num_quadrature: int | None = None):
+        self.num_modes = positive_integer(num_modes, "num_modes")
+        self.dim = positive_integer(dim, "dim")
+        default = max(4 * self.num_modes, 32)
+        self.num_quadrature = self._quadrature(num_quadrature, default, self.size, "2 num_modes + 1")
+
+    @property
+    def size(self) -> int:
+        return 2 * self.num_modes + 1
+
+    @property
+    def laplacian(self) -> Float[Array, " n"]:
+        return jnp.asarray(-(_frequencies(self.num_modes) ** 2))
+
+    def parameters(self, count: int) -> np.ndarray:
+        return equispaced(count)
+
+    def functions(self, s: ArrayLike) -> Any:
+        return fourier_functions(s, self.num_modes)
+
+
+class SineBasis(AbstractBasis):
+    """Functions on [0, length] that vanish at its ends (Dirichlet): coefficients of num_modes functions
+
+        √2 sin(π s / length), √2 sin(2π s / length), ..., √2 sin(mπ s / length)      (m = num_modes),
+
+    orthonormal in L²(ds / length). The q points are midpoints of q equal parts.
+
+    **Arguments:**
+
+    - `num_modes`: m.
+    - `dim`: number of values at a point; 1 for a function.
+    - `length`: of the interval.
+    - `num_quadrature`: q, at least m + 1. With the default max(2m + 2, 32) the coefficients of a field that is cubic in
+        the function are exact (for the cosines too; a quadratic field of sines is no finite sum of sines).
+    """
+
+    num_modes: int = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+    length: float = eqx.field(static=True)
+    num_quadrature: int = eqx.field(static=True)
+
+    def __init__(self, num_modes: int, dim: int, *, length: float = 1.0, num_quadrature: int | None = None):
+        self.num_modes = positive_integer(num_modes, "num_modes")
+        self.dim = positive_integer(dim, "dim")
+        self.length = known_number(length, "length", "a positive number", lambda value: value > 0)
+        default = max(2 * self.num_modes + 2, 32)
+        self.num_quadrature = self._quadrature(num_quadrature, default, self.num_modes + 1, "num_modes + 1")
+
+    @property
+    def size(self) -> int:
+        return self.num_modes
+
+    @property
+    def laplacian(self) -> Float[Array, " n"]:
+        return jnp.asarray(-(self._wave_numbers**2))
+
+    @property
+    def _wave_numbers(self) -> np.ndarray:
+        return np.pi / self.length * np.arange(1, self.num_modes + 1)
+
+    def parameters(self, count: int) -> np.ndarray:
+        return _midpoints(count, self.length)
+
+    def functions(self, s: ArrayLike) -> Any:
+        return sqrt(2) * waves(s, self._wave_numbers)[1]
+
+
+class CosineBasis(AbstractBasis):
+    """Functions on [0, length] without slope at its ends (Neumann): coefficients of num_modes + 1 functions
+
+        1, √2 cos(π s / length), √2 cos(2π s / length), ..., √2 cos(mπ s / length)      (m = num_modes),
+
+    orthonormal in L²(ds / length). The q points are midpoints of q equal parts.
+
+    **Arguments:** those of `SineBasis`; `num_quadrature` is at least m + 1.
+    """
+
+    num_modes: int = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+    length: float = eqx.field(static=True)
+    num_quadrature: int = eqx.field(static=True)
+
+    def __init__(self, num_modes: int, dim: int, *, length: float = 1.0, num_quadrature: int | None = None):
+        self.num_modes = positive_integer(num_modes, "num_modes")
+        self.dim = positive_integer(dim, "dim")
+        self.length = known_number(length, "length", "a positive number", lambda value: value > 0)
+        default = max(2 * self.num_modes + 2, 32)
+        self.num_quadrature = self._quadrature(num_quadrature, default, self.size, "num_modes + 1")
+
+    @property
+    def size(self) -> int:
+        return self.num_modes + 1
+
+    @property
+    def laplacian(self) -> Float[Array, " n"]:
+        return jnp.asarray(-(self._wave_numbers**2))
+
+    @property
+    def _wave_numbers(self) -> np.ndarray:
+        return np.pi / self.length * np.arange(self.num_modes + 1)
+
+    def parameters(self, count: int) -> np.ndarray:
+        return _midpoints(count, self.length)
+
+    def functions(self, s: ArrayLike) -> Any:
+        scale = np.where(np.arange(self.size) == 0, 1.0, sqrt(2))
+        cosines: Any = waves(s, self._wave_numbers)[0]
+        return cosines * scale.astype(cosines.dtype)[None]
+
+
+class FourierSquare(AbstractBasis):
+    """Functions on [0, 2π)², periodic in both directions: coefficients of (2 num_modes + 1)² products of functions
+
+        φ_i(s) φ_j(t), φ those of `FourierBasis`, row i (2 num_modes + 1) + j of a state,
+
+    orthonormal in L²(ds dt / 4π²). The points are a grid, `num_quadrature` in each direction.
+
+    **Arguments:** those of `FourierBasis`. Parameters are pairs, (m, 2).
+    """
+
+    num_modes: int = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+    num_quadrature: int = eqx.field(static=True)
+
+    def __init__(self, num_modes: int, dim: int, *, num_quadrature: int | None = None):
+        self.num_modes = positive_integer(num_modes, "num_modes")
+        self.dim = positive_integer(dim, "dim")
+        least = 2 * self.num_modes + 1
+        default = max(4 * self.num_modes, 8)
+        self.num_quadrature = self._quadrature(num_quadrature, default, least, "2 num_modes + 1")
+
+    @property
+    def size(self) -> int:
+        return (2 * self.num_modes + 1) ** 2
+
+    @property
+    def laplacian(self) -> Float[Array, " n"]:
+        squares = _frequencies(self.num_modes) ** 2
+        return jnp.asarray(-(squares[:, None] + squares[None, :]).reshape(-1))
+
+    @property
+    def grid(self) -> np.ndarray:
+        return self.parameters(self.num_quadrature**2)
+
+    def parameters(self, count: int) -> np.ndarray:
+        side = round(sqrt(count))
+        require(
+            side**2 == count,
+            f"`s` must be given, (m, 2), for points that are no square grid; got {count} points.",
+        )
+        along = equispaced(side)
+        return np.stack(np.meshgrid(along, along, indexing="ij"), axis=-1).reshape(count, 2)
+
+    def functions(self, s: ArrayLike) -> Any:
+        values = fourier_functions(s, self.num_modes, ndim=2)
+        return (values[:, 0, :, None] * values[:, 1, None, :]).reshape(len(values), self.size)
+
+
+def _frequencies(num_modes: int) -> np.ndarray:
+    """0, 1, 1, 2, 2, ..., of the functions of a Fourier basis."""
+    return (np.arange(2 * num_modes + 1.0) + 1) // 2
+
+
+def _midpoints(count: int, length: float) -> np.ndarray:
+    return length * (np.arange(count) + 0.5) / count
