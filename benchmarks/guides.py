@@ -1,6 +1,6 @@
 """How good is a guide? Spread of the log weight, evidence and time, for each guide on simulated, real and small cases.
 
-    python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing butterflies cell gbm]
+    python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing butterflies cell gbm rounds]
 
 One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard error, ESS in percent, k̂
 and whether the evidence is to be trusted, seconds of a run without compilation, and seconds per effective particle. A
@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from semilinear import allen_cahn
 
 import numpyro_bridges as nb
 
@@ -43,6 +44,10 @@ CONSTANT = {
     "DriftGuide(FrozenGuide())": (nb.DriftGuide(nb.FrozenGuide()), None),
     "FrozenGuide(), continuous Euler weight": (nb.FrozenGuide(), diffrax.Euler()),
 }
+
+
+FROZEN = {f"FrozenGuide(rounds={r})": (nb.FrozenGuide(rounds=r), None) for r in range(4)}
+RECEDING = {f"RecedingGuide(rounds={r})": (nb.RecedingGuide(rounds=r), None) for r in range(3)}
 
 
 FOLDER = Path(os.environ.get("NUMPYRO_BRIDGES_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -119,7 +124,33 @@ def gbm():
     yield "gbm", sde, nb.ExactMatch().at([1.5]), setting, -0.872436, GUIDES
 
 
-CASES = {"kunita": kunita, "wing": wing, "butterflies": butterflies, "cell": cell, "gbm": gbm}
+def rounds():
+    """Drifts that are not linear, linearised at the end or along a path."""
+    field = allen_cahn(16, 50)
+    setting = {"x0": field.x0, "t1": 1.0, "num_steps": 50}
+    yield "Allen–Cahn", field.sde, field.condition, setting, None, FROZEN
+    for _, sde, condition, setting, reference, _ in cell():
+        yield "cell", sde, condition, setting, reference, FROZEN
+    well = nb.SDE(lambda t, x, args: -12 * x * (x * x - 1), lambda t, x, args: 1.0)
+    setting = {"x0": [-1.0], "ts": np.linspace(0, 1, 501)}
+    yield "double well", well, nb.ExactMatch().at([1.0]), setting, -4.590, FROZEN
+    sine = nb.SDE(lambda t, x, args: 2 - 2 * jnp.sin(8 * x), lambda t, x, args: 0.5)
+    setting = {"x0": [0.0], "ts": np.linspace(0, 1, 201)}
+    yield "sine", sine, nb.ExactMatch().at([np.pi / 2]), setting, None, FROZEN
+
+    def predation(t, x, args):
+        prey, predators = x
+        return jnp.stack([prey * (1 - predators), predators * (prey - 1)])
+
+    volterra = nb.SDE(predation, lambda t, x, args: 0.3 * x)
+    setting = {"x0": [0.5, 0.5], "t1": 5.0, "num_steps": 200}
+    yield "predator and prey", volterra, nb.InexactMatch(0.01).at([2.0, 1.0]), setting, None, RECEDING
+    logistic = nb.SDE(lambda t, x, args: 2 * x * (1 - x / 2), lambda t, x, args: 0.4 * x)
+    setting = {"x0": [0.3], "t1": 2.0, "num_steps": 100}
+    yield "logistic growth", logistic, nb.ExactMatch().at([2.5]), setting, None, RECEDING
+
+
+CASES = {"kunita": kunita, "wing": wing, "butterflies": butterflies, "cell": cell, "gbm": gbm, "rounds": rounds}
 
 
 def measure(bridge, num_particles: int) -> dict:

@@ -1,5 +1,6 @@
 """Strict settings for everything below the NumPyro layers, and the fixtures that the tests share."""
 
+import gc
 import importlib.metadata
 import os
 import secrets
@@ -8,13 +9,20 @@ from pathlib import Path
 # Before JAX is imported: threads cost more than they give on the small matrices of the tests.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Half of the compile time of small programs, while JAX has this choice; XLA stops at a flag that it does not know.
+# Half of the compile time of small programs, while JAX has this choice, and no parts for other threads. XLA stops at a
+# flag that it does not know.
 if importlib.metadata.version("jaxlib").startswith("0.9."):
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+    os.environ.setdefault(
+        "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+    )
 
 import jax
 import jax.random as jr
 import pytest
+
+# Tracing makes many small objects that live on: to look for garbage among them as often as by default takes a sixth of
+# the time of the suite.
+gc.set_threshold(200_000, 20, 50)
 
 jax.config.update("jax_enable_x64", True)
 

@@ -565,7 +565,13 @@ OTHERS["steps of their own"] = {"num_steps": (2, 4, 2, 6, 4)}
 NARROW = nb.SDE(lambda t, x, a: -x, lambda t, x, a: jnp.stack([jnp.cos(x[:, 0]), jnp.ones(3)], 1))
 
 
-@pytest.mark.parametrize("name", KINDS)
+SEVERAL_WAYS = [
+    pytest.param(name, marks=pytest.mark.slow if name in ("some points", "chain", "one branch") else ())
+    for name in KINDS
+]
+
+
+@pytest.mark.parametrize("name", SEVERAL_WAYS)
 def test_the_way_back_to_the_noise(name, key):
     """Simulated paths are those of their noise; paths meet at the nodes, and end in what is seen exactly."""
     match, tree, guide = KINDS[name]

@@ -126,6 +126,16 @@ def test_mosquito_tree(tmp_path):
 
 
 @pytest.mark.slow
+def test_allen_cahn(tmp_path):
+    pytest.importorskip("matplotlib")
+    out = run(str(ROOT / "examples/allen_cahn.py"), "--quick", "--output", "output", cwd=tmp_path)
+    assert "8 functions" in out and "r_hat" in out and "the truth: diffusivity 0.02" in out
+    assert 80 <= float(re.search(r"([\d.]+) % of the true field", out).group(1))
+    for name in ("allen_cahn.nc", "allen_cahn_field.png", "allen_cahn_posterior.png"):
+        assert (tmp_path / "output" / name).stat().st_size > 5000
+
+
+@pytest.mark.slow
 def test_growth(tmp_path):
     pytest.importorskip("matplotlib")
     out = run(str(ROOT / "examples/growth.py"), "--quick", "--output", "output", cwd=tmp_path)

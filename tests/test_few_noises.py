@@ -247,6 +247,7 @@ def test_tree_of_few_noises(key):
     assert np.std(log_weights) < 0.2
 
 
+@pytest.mark.slow  # as of a tree of all noises, which runs always
 def test_priors_on_everything_in_both_precisions():
     """Kernel, jitter, errors, lengths, start and guide, on a tree, inside a model under jit: float32 within 0.02."""
     data = np.stack([V, 0.95 * V, 1.05 * X0])

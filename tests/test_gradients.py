@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 import numpyro_bridges as nb
 from numpyro_bridges._linalg import safe_sqrt
 from numpyro_bridges.guiding._score import Standard
-from numpyro_bridges.sdes._linear import _phi1
+from numpyro_bridges.sdes._exponential import _phi1
 from numpyro_bridges.sdes._noise import AbstractNoise
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
@@ -100,6 +100,24 @@ def jittered(p):
 def controls(p):
     kernel = nb.GaussianKernel(p["amplitude"], p["length_scale"])
     return nb.KunitaFlow(nb.Landmarks(3, 2), kernel, noise=nb.ControlNoise(points=[1]))
+
+
+def semilinear(space):
+    """Of a space whose basis has two or three functions."""
+
+    def made(p):
+        def pulled(t, x, rate):
+            u = space.to_points(x)
+            return space.from_points(rate * (u - u**3))
+
+        linear = p["diffusivity"] * space.laplacian
+        return nb.SemilinearSDE(linear, pulled, p["diffusion"], p["rate"], space=space)
+
+    return made
+
+
+def along_a_path(p):
+    return nb.RecedingGuide(rounds=2)
 
 
 def spectral(p):
@@ -192,6 +210,8 @@ MIXED = {"factor": 0.5, "length_scale": 0.9, "end_weight": 0.2}
 CELLS = {"x0": np.array([[0.2], [1.0], [-0.6]]), "lower": -4.0}  # two of them are midpoints of cells
 MEETING = {"x0": np.array([[0.2], [0.2], [-0.6]]), "lower": -4.0}
 CLOCK = {"x0": PLAIN["x0"], "observed": PLAIN["observed"], "variance": 0.1, "drift": -0.5}
+FIELD = {"diffusivity": 0.2, "diffusion": 0.4, "rate": 0.7}
+SQUARE = {"x0": np.linspace(-0.1, 0.2, 81), "observed": 0.1 * np.cos(np.arange(81)), "t1": 1.2, "variance": 0.1}
 PIN = {"x0": PLAIN["x0"], "t1": 1.2, "pin": 0.4, "lower": -0.2, "upper": 0.5}
 RANK_ONE = {"drift": B, "diffusion": B[:, 1:], "operator": np.array([[1.0, 0.5], [0.0, 1.0]])}
 
@@ -202,6 +222,9 @@ CASES = {
     "no matrix of rates": (linear, inexact, no_guide, PLAIN | {"drift": np.zeros((2, 2)), "diffusion": MATRIX}),
     "rank one": (linear, inexact, no_guide, PLAIN | RANK_ONE),
     "learned": (user, inexact, learned, PLAIN | DIAGONAL | {"network": 0.3}),
+    "semilinear": (semilinear(nb.CosineBasis(1, 1)), inexact, no_guide, PLAIN | FIELD),
+    "semilinear, along a path": (semilinear(nb.SineBasis(2, 1)), inexact, along_a_path, PLAIN | FIELD),
+    "semilinear, diagonal": (semilinear(nb.FourierSquare(4, 1)), inexact, no_guide, FIELD | SQUARE),
     "covariance": (brownian, inexact, no_guide, PLAIN | {"Q": MATRIX, "variance": 0.1 * MATRIX}),
     "exact": (linear, exact, unguided, FEW | RATE),
     "pinned": (linear, pinned, no_guide, PIN | RATE),

@@ -88,7 +88,10 @@ def run(kernel, *args, num_warmup=300, num_samples=1000, num_chains=4, **setting
     return mcmc
 
 
-@pytest.mark.parametrize("name", KERNELS)
+SOME = [pytest.param(name, marks=pytest.mark.slow if name in ("PCN", "pseudo-marginal-20") else ()) for name in KERNELS]
+
+
+@pytest.mark.parametrize("name", SOME)
 def test_conjugate_posterior(name):
     """Mean within 3 standard errors, which are below 0.02 posterior SD; SD within 3 %."""
     draws = {"FunctionSpaceHMC": 4000, "PCN": 5000, "PCN-blocks": 5000, "PCNL": 5000, "MALA-2": 8000}.get(name, 16000)
@@ -102,7 +105,13 @@ def test_conjugate_posterior(name):
     assert gelman_rubin(x) < 1.01
 
 
-@pytest.mark.parametrize("name", ["FunctionSpaceHMC", "PCN-blocks", "PCNL", "pseudo-marginal-2", "MALA-2"])
+SLOW = pytest.mark.slow
+"""For one of several kernels of a kind, the others of which run always."""
+
+
+@pytest.mark.parametrize(
+    "name", ["FunctionSpaceHMC", "PCN-blocks", pytest.param("PCNL", marks=SLOW), "pseudo-marginal-2", "MALA-2"]
+)
 def test_stays_in_the_joint_law(name):
     """From exact draws of (θ, noise, data), some steps given the data leave (θ, noise, data) as they were.
 

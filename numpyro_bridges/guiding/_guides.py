@@ -230,7 +230,7 @@ def smoothed(guide, sde: Displaced, seen: Observation, observed: State, referenc
     def along(states):
         return eqx.tree_at(lambda g: g.way, guide, Way(ts[:-1], states), is_leaf=lambda leaf: leaf is None)
 
-    def another_round(states, _):
+    def another_round(states):
         plan = along(states).plan(sde, seen, reference, ts)
 
         def step(y, inputs):
@@ -240,12 +240,14 @@ def smoothed(guide, sde: Displaced, seen: Observation, observed: State, referenc
             return transition.mean + apply(transition.factor, steering.mean()), y
 
         ends = jax.tree.map(lambda a: a[1:], plan.steps)
-        last, path = jax.lax.scan(step, start, (ts[:-2], ts[1:-1], ends))
+        first = varying_like(start, sde, seen, observed, ts)
+        last, path = jax.lax.scan(step, first, (ts[:-2], ts[1:-1], ends))
         path = jnp.concatenate([path, last[None]])
-        return jnp.where(jnp.all(jnp.isfinite(path)), path, states), None
+        return jnp.where(jnp.all(jnp.isfinite(path)), path, states)
 
-    line = varying_like(line, sde, seen, observed, ts)
-    states, _ = jax.lax.scan(another_round, line, None, length=guide.rounds - 1)
+    states = line
+    for _ in range(guide.rounds - 1):  # a loop of JAX within loops takes longer to compile than a second copy
+        states = another_round(states)
     return along(states)
 
 

@@ -63,7 +63,7 @@ class _Coefficient(eqx.Module):
         return jnp.asarray(floating(value, f"{self.name}(t, x, args)"), x.dtype)
 
 
-class FunctionSDE(AbstractSDE):
+class AbstractFunctionSDE(AbstractSDE):
     """An SDE two of whose coefficients are a user's functions f(t, x, args): `diffusion`, and one that pulls."""
 
     diffusion_function: Any
@@ -124,7 +124,7 @@ class FunctionSDE(AbstractSDE):
         return not depends_on(lambda t, y: self.noise(t, y)[0], x, 1)
 
 
-class SDE(FunctionSDE):
+class SDE(AbstractFunctionSDE):
     """dX = drift(t, X, args) dt + diffusion(t, X, args) dW, stepped by Euler–Maruyama.
 
     **Arguments:**

@@ -9,18 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from .._checks import as_float, require, require_finite
-from .._linalg import add, apply, as_columns, columns
+from .._linalg import add, apply
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
 from ._base import AbstractSDE, AffineStep, Transition, at_any_time
 from ._exponential import affine_step, exponential_noise_size, exponential_transition
-from ._sde import FunctionSDE
+from ._sde import AbstractFunctionSDE
 
 _MAX_LINEARISED = 64
 """Largest state, n · dim numbers, of which the nonlinearity has its full Jacobian; beyond, its diagonal."""
 
 
-class SemilinearSDE(FunctionSDE):
+class SemilinearSDE(AbstractFunctionSDE):
     """dX = (A X + F(t, X)) dt + B(t, X) dW, stepped by exponential Euler.
 
     x' = e^{A dt} x + ∫₀^dt e^{Au} du F(t, x) + N(0, ∫₀^dt e^{Au} B Bᵀ e^{Aᵀu} du), F and B held at the start of a step:
@@ -111,20 +111,23 @@ class SemilinearSDE(FunctionSDE):
 
     def _linearised(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         """F' and β with F(t, y) ≈ F' y + β near x; F' acts on the first axis, its mean over columns."""
-        value, along = jax.linearize(lambda y: self.pulled(t, y), x)
-        directions = jnp.arange(x.size)
-
-        def slopes(direction):
-            """How the columns of F change with one number of the state, in its own column alone."""
-            i, column = jnp.divmod(direction, columns(x))
-            moved = along(jnp.zeros_like(x).reshape(-1).at[direction].set(1.0).reshape(x.shape))
-            change = as_columns(moved)[:, column] / columns(x)
-            return change if x.size <= _MAX_LINEARISED else change[i]
-
-        found = jax.lax.map(slopes, directions, batch_size=_MAX_LINEARISED)
-        summed = jnp.sum(found.reshape(x.shape[0], columns(x), *found.shape[1:]), axis=1)
-        slope = summed.T  # (i, j) where j was moved
+        value = self.pulled(t, x)
+        if x.size <= _MAX_LINEARISED:
+            jacobian = jax.jacfwd(self.pulled, argnums=1)(t, x)
+            slope = jacobian if x.ndim == 1 else jnp.einsum("idjd->ij", jacobian) / x.shape[1]
+        else:
+            slope = self._diagonal_slope(t, x)
         return slope, value - apply(slope, x)
+
+    def _diagonal_slope(self, t: RealScalar, x: State) -> Structured:
+        """The diagonal of F', one product with it at a time, so that no n × n matrix is held."""
+        _, along = jax.linearize(lambda y: self.pulled(t, y), x)
+
+        def entry(direction):
+            return along(jnp.zeros_like(x).reshape(-1).at[direction].set(1.0).reshape(x.shape)).reshape(-1)[direction]
+
+        entries = jax.lax.map(entry, jnp.arange(x.size), batch_size=_MAX_LINEARISED)
+        return jnp.mean(entries.reshape(x.shape[0], -1), axis=1)
 
 
 class _Constant(eqx.Module):
