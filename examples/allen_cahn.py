@@ -10,8 +10,8 @@
 # resolution is too fine for a step. Six places are measured at six times, with an error. How fast does the field spread
 # and react, how strong is the noise, and what was the field where nobody looked?
 #
-#     python examples/allen_cahn.py              # some minutes on two cores
-#     python examples/allen_cahn.py --quick      # about a minute
+#     python examples/allen_cahn.py              # on two cores some ten minutes
+#     python examples/allen_cahn.py --quick      # two or three, most of which is compilation
 #     python examples/allen_cahn.py --modes 60   # the same answer: no more of the field is seen
 
 # %%
@@ -138,7 +138,7 @@ figure, axes = plt.subplots(1, 3, figsize=(11, 3.4), sharey=True, constrained_la
 for ax, (title, values) in zip(axes, panels.items(), strict=True):
     limits = {"vmin": -1.5, "vmax": 1.5, "cmap": "RdBu_r"} if "SD" not in title else {"vmin": 0, "cmap": "viridis"}
     shown = ax.pcolormesh(grid, along, np.asarray(values).T, shading="gouraud", **limits)
-    ax.plot(*(points.ravel() for points in np.meshgrid(times, places)), "k.", markersize=4)
+    ax.plot(*(points.ravel() for points in np.meshgrid(times, places)), "k.", markersize=4, clip_on=False)
     ax.set(title=title, xlabel="time")
     figure.colorbar(shown, ax=ax)
 axes[0].set_ylabel("place")
