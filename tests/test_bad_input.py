@@ -759,6 +759,18 @@ def table() -> dict[str, Row]:
             color="free",
             kwargs="free",
         ),
+        "plot.deformation": row(
+            plot.deformation,
+            True,
+            flow=("free", nb.KunitaFlow(SPACE, KERNEL)),
+            path=("array", PATHS),
+            ax="axes?",
+            num_lines=("count", 2),
+            margin=("setting", 0.1),
+            closed=("flag", True),
+            cmap="free",
+            kwargs="free",
+        ),
         "plot.score_frames": row(
             plot.score_frames,
             True,

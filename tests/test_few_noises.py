@@ -311,7 +311,9 @@ def test_carry(name):
     there = sde.carry(path, points)
     np.testing.assert_allclose(sde.carry(path, there[-1], inverse=True), there, atol=1e-10)
     slopes = jax.jit(jax.vmap(jax.jacfwd(lambda p: sde.carry(path, p[None])[-1, 0])))(points)
-    assert np.all(np.linalg.det(slopes) > 0) and np.max(np.abs(there[-1] - points)) > 0.05
+    stretched = sde.jacobian(path, points)
+    np.testing.assert_allclose(stretched[-1], np.linalg.det(slopes), rtol=1e-6)
+    assert np.all(stretched[0] == 1) and np.all(stretched > 0) and np.max(np.abs(there[-1] - points)) > 0.05
     step = 1e-5
     moved = sde.carry(path, points + np.array([step, 0.0]))[-1]
     np.testing.assert_allclose((moved - there[-1]) / step, slopes[..., 0], rtol=2e-3, atol=2e-3)

@@ -337,3 +337,37 @@ def test_without_matplotlib(monkeypatch, shapes):
     ):
         with pytest.raises(ImportError, match=r"pip install 'numpyro_bridges\[examples\]'"):
             draw()
+
+
+def test_deformation(shapes):
+    """A grid of a known path: as `carry` has it, coloured by the area of its cells; the outlines of start and end."""
+    flow = nb.KunitaFlow(nb.Landmarks(12, 2), nb.GaussianKernel(0.3, 0.8))
+    path = np.linspace(shapes.points[0], shapes.points[3], 6)
+    mesh = plot.deformation(flow, path, num_lines=8, margin=0.5)
+    corners = np.asarray(mesh.get_coordinates())
+    area = np.asarray(mesh.get_array()).reshape(corners.shape[:2])
+    low, high = path[0].min(axis=0), path[0].max(axis=0)
+    reach = 0.5 * (high - low).max()
+    np.testing.assert_allclose(corners[0, 0], flow.carry(path, (low - reach)[None])[-1, 0], atol=1e-10)
+    np.testing.assert_allclose(corners[-1, -1], flow.carry(path, (high + reach)[None])[-1, 0], atol=1e-10)
+    sides = (high - low + 2 * reach) / (np.array(area.shape) - 1)
+    one, other = corners[1:, 1:] - corners[:-1, :-1], corners[:-1, 1:] - corners[1:, :-1]  # diagonals
+    cells = (one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]) / 2 / np.prod(sides)
+    at_corners = 2.0**area
+    mean = (at_corners[1:, 1:] + at_corners[1:, :-1] + at_corners[:-1, 1:] + at_corners[:-1, :-1]) / 4
+    np.testing.assert_allclose(cells, mean, rtol=0.02)
+    assert mesh.get_clim()[1] == pytest.approx(np.abs(area).max()) and np.ptp(area) > 0.3
+    drawn = [line.vertices for lines in mesh.axes.collections[-2:] for line in lines.get_paths()]
+    np.testing.assert_allclose(drawn[0][:-1], path[0])
+    np.testing.assert_allclose(drawn[1][:-1], path[-1])
+    mesh.figure.canvas.draw()
+
+
+def test_deformation_refuses(shapes):
+    path, kernel = np.stack([shapes.points[0]] * 2), nb.GaussianKernel(0.3, 0.8)
+    with pytest.raises(ValueError, match="`flow` must be a flow"):
+        plot.deformation(nb.BrownianMotion(1.0), path)
+    with pytest.raises(ValueError, match=r"`flow` must move points of the plane.*R\^3"):
+        plot.deformation(nb.KunitaFlow(nb.Landmarks(12, 3), kernel), path)
+    with pytest.raises(ValueError, match="`num_lines` must be an integer, at least 2; got 1"):
+        plot.deformation(nb.KunitaFlow(nb.Landmarks(12, 2), kernel), path, num_lines=1)

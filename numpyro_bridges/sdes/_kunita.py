@@ -182,6 +182,38 @@ class KunitaFlow(AbstractSDE):
         **Arguments:** `path`: the states of a bridge, or of one branch of a tree. `points`: at the first time, or,
         where `inverse`, at the last: then the way back, by solving each step for the point that it moves there.
         """
+        shapes, points, velocity_at = self._carrying(path, points)
+        inverse = flag(inverse, "inverse")
+
+        def step(p, inputs):
+            velocity = velocity_at(*inputs)
+            p = _origin_of(velocity, p) if inverse else p + velocity(p)
+            return p, p
+
+        _, moved = lax.scan(step, points, (shapes[:-1], jnp.diff(shapes, axis=0)), reverse=inverse)
+        moved = jnp.concatenate([moved, points[None]] if inverse else [points[None], moved])
+        same = jnp.all(points[:, None] == shapes[-1 if inverse else 0][None], axis=-1)
+        return jnp.where(jnp.any(same, axis=1)[None, :, None], shapes[:, jnp.argmax(same, axis=1)], moved)
+
+    def jacobian(
+        self, path: Float[Array, "K+1 n dim"], points: Float[Array, "q dim"]
+    ) -> Float[Array, "K+1 q"]:
+        """By how much `carry` stretches the neighbourhood of points, the determinant of its derivative, at its times.
+
+        It is positive where steps are short enough for what is carried to be a diffeomorphism.
+        """
+        shapes, points, velocity_at = self._carrying(path, points)
+
+        def step(p, inputs):
+            velocity = velocity_at(*inputs)
+            slope = jax.vmap(jax.jacfwd(lambda q: q + velocity(q[None])[0]))(p)
+            return p + velocity(p), jnp.linalg.det(slope)
+
+        _, stretched = lax.scan(step, points, (shapes[:-1], jnp.diff(shapes, axis=0)))
+        return jnp.concatenate([jnp.ones_like(stretched[:1]), jnp.cumprod(stretched, axis=0)])
+
+    def _carrying(self, path, points) -> tuple[Array, Array, Callable[[Array, Array], Callable]]:
+        """The points of the path's shapes, the points to be carried, and the field that moves a shape like this."""
         path, points = as_float(path, "path"), as_float(points, "points")
         n, dim = self.space.size, self.space.dim
         require(
@@ -192,20 +224,9 @@ class KunitaFlow(AbstractSDE):
             points.ndim == 2 and points.shape[1] == dim,
             f"`points` must have shape (q, {dim}); got {points.shape}.",
         )
-        inverse = flag(inverse, "inverse")
         shapes = jax.vmap(self.space.to_points)(path)
         field = self.noise_field.chosen(shapes[0])
-
-        def step(p, inputs):
-            shape, moves = inputs
-            velocity = field.velocity(self.kernel, self.covariance_kernel, shape, moves)
-            p = _origin_of(velocity, p) if inverse else p + velocity(p)
-            return p, p
-
-        _, moved = lax.scan(step, points, (shapes[:-1], jnp.diff(shapes, axis=0)), reverse=inverse)
-        moved = jnp.concatenate([moved, points[None]] if inverse else [points[None], moved])
-        same = jnp.all(points[:, None] == shapes[-1 if inverse else 0][None], axis=-1)
-        return jnp.where(jnp.any(same, axis=1)[None, :, None], shapes[:, jnp.argmax(same, axis=1)], moved)
+        return shapes, points, lambda shape, moves: field.velocity(self.kernel, self.covariance_kernel, shape, moves)
 
     def start(self, x: State) -> State:
         index = self.noise_field.factored_at(x)
