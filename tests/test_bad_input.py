@@ -215,7 +215,9 @@ def table() -> dict[str, Row]:
             shift=("array", np.zeros(2)),
             space="space?",
         ),
-        "BrownianMotion": row(nb.BrownianMotion, covariance=("array", np.eye(2)), space="space?"),
+        "BrownianMotion": row(
+            nb.BrownianMotion, covariance=("array", np.eye(2)), factor="free", space="space?"
+        ),
         "SDE": row(
             nb.SDE,
             drift=("function", drift),

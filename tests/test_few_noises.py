@@ -7,6 +7,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import scipy.stats
 from jax.scipy.special import logsumexp
 from numpyro.infer.util import log_density
 
@@ -283,6 +284,42 @@ def test_priors_on_everything_in_both_precisions():
         largest = np.max(np.abs(slopes[name]))
         assert largest > 0
         np.testing.assert_allclose(single_slopes[name], slopes[name], rtol=0, atol=2e-3 * largest, err_msg=name)
+
+
+# Brownian motion of a smooth field: as many noises as it has directions.
+
+
+def test_a_smooth_covariance_on_many_points(key):
+    """256 points, a length scale of 64 of them: singular to the last digit; by SciPy's dense normal."""
+    s = np.linspace(0, 4, 256)
+    Q = np.exp(-((s[:, None] - s[None]) ** 2) / 2)
+    x0, v = np.sin(s), np.cos(s)
+    expected = scipy.stats.multivariate_normal(x0, 0.7 * Q + 0.01 * np.eye(256)).logpdf(v)
+    walk = nb.BrownianMotion(Q)
+    assert walk.noise_size(jnp.asarray(x0)) < 30
+    for sde in (walk, nb.BrownianMotion(factor=walk.factor)):
+        bridge = nb.GuidedBridge(sde, nb.InexactMatch(0.01).at(v), x0=x0, t1=0.7, num_steps=3)
+        weight = bridge.log_weight(jr.normal(key, bridge.noise_shape))
+        np.testing.assert_allclose(weight, expected, rtol=1e-8)
+    assert nb.BrownianMotion([1.0, 0.0]).factor is None and nb.BrownianMotion(np.ones((3, 3))).factor.shape == (3, 1)
+
+
+def test_a_factor_may_be_traced():
+    """The slope of the log density by the scale of a factor of rank one, against SciPy."""
+    F, v = np.array([[1.0], [2.0], [-0.5]]), np.array([0.3, 1.0, 0.2])
+
+    def log_density(scale):
+        walk = nb.BrownianMotion(factor=scale * F)
+        bridge = nb.GuidedBridge(walk, nb.InexactMatch(0.1).at(v), x0=np.zeros(3), t1=1.0, num_steps=2)
+        return bridge.log_weight(jnp.ones(bridge.noise_shape))
+
+    value, slope = jax.jit(jax.value_and_grad(log_density))(1.3)
+    low, middle, high = (
+        scipy.stats.multivariate_normal(np.zeros(3), c**2 * F @ F.T + 0.1 * np.eye(3)).logpdf(v)
+        for c in (1.3 - 1e-5, 1.3, 1.3 + 1e-5)
+    )
+    np.testing.assert_allclose(value, middle, rtol=1e-10)
+    np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
 
 
 # What a path does to other points.

@@ -164,6 +164,7 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
         weight,
     ),
     "BrownianMotion": (nb.BrownianMotion, {"covariance": times(Q @ Q.T), "space": POINTS}, weight),
+    "BrownianMotion, factor": (nb.BrownianMotion, {"factor": times(R), "space": POINTS}, weight),
     "KunitaFlow": (
         nb.KunitaFlow,
         {"space": POINTS, "kernel": Of(lambda t: nb.GaussianKernel(0.3 * t, 0.7)), "noise": "spectral"},

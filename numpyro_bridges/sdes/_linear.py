@@ -8,6 +8,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import as_float, concrete, require, require_finite
@@ -23,16 +24,34 @@ class BrownianMotion(AbstractSDE):
 
     **Arguments:**
 
-    - `covariance`: Q, `()`, `(n,)` (a diagonal) or `(n, n)`, positive definite.
+    - `covariance`: Q, `()`, `(n,)` (a diagonal) or `(n, n)`, positive semi-definite: that of a smooth field on many
+      points is singular to the last digit, and is held by a factor of as many columns as it has directions. A traced
+      matrix must be definite, since its directions cannot be counted.
+    - `factor`: F `(n, m)` instead, with Q = F Fᵀ; also traced, and of any rank.
     - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
     """
 
-    covariance_operator: Structured
+    covariance_operator: Structured | None
+    factor: Float[Array, "n m"] | None
     space: AbstractSpace | None
     has_exact_transition: ClassVar[bool] = True
 
-    def __init__(self, covariance: ArrayLike, *, space: AbstractSpace | None = None):
-        self.covariance_operator = as_covariance(covariance, "covariance")
+    def __init__(
+        self,
+        covariance: ArrayLike | None = None,
+        *,
+        factor: ArrayLike | None = None,
+        space: AbstractSpace | None = None,
+    ):
+        require((covariance is None) != (factor is None), "Give `covariance` or `factor`, one of the two.")
+        if factor is not None:
+            Q, F = None, as_float(factor, "factor")
+            require_finite(F, "factor")
+            require(F.ndim == 2 and F.size > 0, f"`factor` must be a matrix (n, m); got shape {F.shape}.")
+        else:
+            Q = _as_symmetric(covariance, "covariance")
+            F = _factor_of_singular(Q, "covariance")
+        self.covariance_operator, self.factor = (Q, None) if F is None else (None, F)
         require_space(space)
         self.space = space
 
@@ -40,6 +59,9 @@ class BrownianMotion(AbstractSDE):
         return jnp.zeros_like(x)
 
     def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
+        if self.factor is not None:
+            return self.factor, compose(self.factor, transpose(self.factor))
+        assert self.covariance_operator is not None
         Q = symmetric(self.covariance_operator)
         return semidefinite_cholesky(Q), Q
 
@@ -179,21 +201,48 @@ class LinearSDE(AbstractSDE):
 
 def as_covariance(value, name: str) -> Array:
     """A scalar, diagonal or matrix that is positive definite, where that can be known."""
+    Q = _as_symmetric(value, name)
+    require(
+        concrete(Q) is None or _is_definite(Q),
+        f"`{name}` must be positive definite; its Cholesky factorisation fails. Remove duplicated points, or add a "
+        "small multiple of the identity.",
+    )
+    return Q
+
+
+def _as_symmetric(value, name: str) -> Array:
     Q = as_float(value, name)
     require_finite(Q, name)
     require(
         Q.ndim < 2 or (Q.ndim == 2 and Q.shape[0] == Q.shape[1]), f"`{name}` must be (), (n,) or (n, n); got {Q.shape}."
     )
-    if concrete(Q) is not None:
-        factor = semidefinite_cholesky(Q)
-        require(
-            Q.ndim < 2 or jnp.allclose(Q, Q.T),
-            f"`{name}` must be symmetric; it differs from its transpose by {concrete(jnp.max(jnp.abs(Q - Q.T)))}. "
-            "Give the covariance, no factor of it.",
-        )
-        require(
-            jnp.all(jnp.isfinite(factor)) & jnp.all((factor if Q.ndim < 2 else jnp.diagonal(factor)) > 0),
-            f"`{name}` must be positive definite; its Cholesky factorisation fails. Remove duplicated points, or add a "
-            "small multiple of the identity.",
-        )
+    require(
+        Q.ndim < 2 or concrete(Q) is None or jnp.allclose(Q, Q.T),
+        f"`{name}` must be symmetric; it differs from its transpose by {concrete(jnp.max(jnp.abs(Q - Q.T)))}. "
+        "Give the covariance, no factor of it.",
+    )
     return Q
+
+
+def _is_definite(Q: Array) -> bool:
+    factor = semidefinite_cholesky(Q)
+    diagonal = factor if Q.ndim < 2 else jnp.diagonal(factor)
+    return bool(jnp.all(jnp.isfinite(factor)) & jnp.all(diagonal > 0))
+
+
+def _factor_of_singular(Q: Array, name: str) -> Array | None:
+    """F with F Fᵀ = Q for a matrix that is known to have fewer directions than rows; `None` for any other."""
+    value = concrete(Q)
+    if value is None or _is_definite(Q):
+        return None
+    eigenvalues, vectors = np.linalg.eigh(value) if Q.ndim == 2 else (np.atleast_1d(value), None)
+    least, largest = eigenvalues.min(), eigenvalues.max()
+    rounding = 10 * len(eigenvalues) * np.finfo(value.dtype).eps * largest
+    require(
+        largest > 0 and least >= -rounding,
+        f"`{name}` must be positive semi-definite, and not 0; its eigenvalues are from {least:.3g} to {largest:.3g}.",
+    )
+    if vectors is None:
+        return None
+    kept = eigenvalues > rounding
+    return jnp.asarray(vectors[:, kept] * np.sqrt(eigenvalues[kept]))
