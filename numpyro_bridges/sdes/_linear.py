@@ -203,7 +203,7 @@ def as_covariance(value, name: str) -> Array:
     """A scalar, diagonal or matrix that is positive definite, where that can be known."""
     Q = _as_symmetric(value, name)
     require(
-        concrete(Q) is None or _is_definite(Q),
+        _is_definite(concrete(Q)),
         f"`{name}` must be positive definite; its Cholesky factorisation fails. Remove duplicated points, or add a "
         "small multiple of the identity.",
     )
@@ -224,16 +224,20 @@ def _as_symmetric(value, name: str) -> Array:
     return Q
 
 
-def _is_definite(Q: Array) -> bool:
-    factor = semidefinite_cholesky(Q)
-    diagonal = factor if Q.ndim < 2 else jnp.diagonal(factor)
-    return bool(jnp.all(jnp.isfinite(factor)) & jnp.all(diagonal > 0))
+def _is_definite(Q: np.ndarray | None) -> bool:
+    """Whether it is, or is not known. In NumPy: inside a traced program JAX would not say."""
+    if Q is None or Q.ndim < 2:
+        return Q is None or bool(np.all(Q > 0))
+    try:
+        return bool(np.all(np.diagonal(np.linalg.cholesky(Q)) > 0))
+    except np.linalg.LinAlgError:
+        return False
 
 
 def _factor_of_singular(Q: Array, name: str) -> Array | None:
     """F with F Fᵀ = Q for a matrix that is known to have fewer directions than rows; `None` for any other."""
     value = concrete(Q)
-    if value is None or _is_definite(Q):
+    if value is None or _is_definite(value):
         return None
     eigenvalues, vectors = np.linalg.eigh(value) if Q.ndim == 2 else (np.atleast_1d(value), None)
     least, largest = eigenvalues.min(), eigenvalues.max()
