@@ -147,6 +147,15 @@ def test_evidence_is_that_of_quadrature(diffusion, guide):
     assert abs(found.log_evidence - expected) < 4 * found.standard_error
 
 
+def test_one_step_has_the_closed_form():
+    sde = nb.SemilinearSDE(-1.0, lambda t, x, args: jnp.sin(x), 0.5)
+    bridge = nb.GuidedBridge(sde, nb.InexactMatch(0.1).at([0.3]), x0=[0.1], t1=0.5, num_steps=1)
+    mean = np.exp(-0.5) * 0.1 - np.expm1(-0.5) * np.sin(0.1)
+    variance = -0.25 * np.expm1(-1.0) / 2 + 0.1
+    expected = -0.5 * (0.3 - mean) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)
+    np.testing.assert_allclose(bridge.log_weight(np.zeros(bridge.noise_shape)), expected, rtol=1e-12)
+
+
 def test_a_chain_of_observations_is_that_of_quadrature():
     """Two times; each branch has its own steps, and the first is led by what is seen later."""
     v, lengths, K = [0.4, 1.3], [0.5, 0.7], 4
