@@ -29,6 +29,12 @@ def run(*command, cwd):
     return done.stdout
 
 
+def require_written(folder, *names):
+    """Files of some size in the folder of what an example leaves."""
+    for name in names:
+        assert (folder / "output" / name).stat().st_size > 5000
+
+
 def test_first_page(tmp_path):
     pytest.importorskip("ktch")
     page = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S).group(1)
@@ -52,8 +58,7 @@ def test_mosquito_wings(tmp_path):
     pytest.importorskip("matplotlib")
     out = run(str(ROOT / "examples/mosquito_wings.py"), "--quick", "--output", "output", cwd=tmp_path)
     assert "r_hat" in out and "divergences: 0" in out
-    for name in ("wings.nc", "bridges.png", "posterior.png", "score.png"):
-        assert (tmp_path / "output" / name).stat().st_size > 5000
+    require_written(tmp_path, "wings.nc", "bridges.png", "posterior.png", "score.png")
 
 
 def test_phylogeny_reads_files(tmp_path):
@@ -70,8 +75,7 @@ def test_phylogeny_reads_files(tmp_path):
     out = run(str(ROOT / "examples/phylogeny.py"), *chosen, cwd=tmp_path)
     assert "tips without shapes, left out: d" in out and "5 specimens of 3 species, 10 points" in out
     assert "r_hat" in out and "divergences: 0" in out and "ancestors: 40 coordinates" in out
-    for name in ("phylogeny.nc", "phylogeny_ladder.png", "phylogeny_posterior.png"):
-        assert (tmp_path / "output" / name).stat().st_size > 5000
+    require_written(tmp_path, "phylogeny.nc", "phylogeny_ladder.png", "phylogeny_posterior.png")
 
 
 PREPARED = """
@@ -121,8 +125,7 @@ def test_mosquito_tree(tmp_path):
     pytest.importorskip("matplotlib")
     out = run(str(ROOT / "examples/mosquito_tree.py"), "--quick", "--output", "output", cwd=tmp_path)
     assert "126 specimens of 11 species, 16 points" in out and "r_hat" in out and "ancestors: 320 coordinates" in out
-    for name in ("mosquito_tree.nc", "mosquito_tree_ladder.png", "mosquito_tree_posterior.png"):
-        assert (tmp_path / "output" / name).stat().st_size > 5000
+    require_written(tmp_path, "mosquito_tree.nc", "mosquito_tree_ladder.png", "mosquito_tree_posterior.png")
 
 
 @pytest.mark.slow
@@ -131,8 +134,7 @@ def test_allen_cahn(tmp_path):
     out = run(str(ROOT / "examples/allen_cahn.py"), "--quick", "--output", "output", cwd=tmp_path)
     assert "8 functions" in out and "r_hat" in out and "the truth: diffusivity 0.02" in out
     assert 80 <= float(re.search(r"([\d.]+) % of the true field", out).group(1))
-    for name in ("allen_cahn.nc", "allen_cahn_field.png", "allen_cahn_posterior.png"):
-        assert (tmp_path / "output" / name).stat().st_size > 5000
+    require_written(tmp_path, "allen_cahn.nc", "allen_cahn_field.png", "allen_cahn_posterior.png")
 
 
 @pytest.mark.slow
@@ -140,8 +142,7 @@ def test_growth(tmp_path):
     pytest.importorskip("matplotlib")
     out = run(str(ROOT / "examples/growth.py"), "--quick", "--output", "output", cwd=tmp_path)
     assert "12 animals, 6 ages" in out and "r_hat" in out and "the truth: rate 3" in out
-    for name in ("growth.nc", "growth_series.png", "growth_posterior.png"):
-        assert (tmp_path / "output" / name).stat().st_size > 5000
+    require_written(tmp_path, "growth.nc", "growth_series.png", "growth_posterior.png")
 
 
 @pytest.mark.slow
@@ -157,8 +158,7 @@ def test_learned_vs_guided(tmp_path):
         assert abs(row["log_evidence"] - rows["guided"]["log_evidence"]) < 4 * joint + 1e-3, row
     # A check that all runs: so few draws have Monte Carlo errors that are themselves badly known.
     assert all(abs(z) < 6 for row in found["difference_in_errors"].values() for z in row.values()), found
-    for name in ("training.png", "comparison.png", "posteriors.png"):
-        assert (tmp_path / "output" / name).stat().st_size > 5000
+    require_written(tmp_path, "training.png", "comparison.png", "posteriors.png")
 
 
 @pytest.mark.slow

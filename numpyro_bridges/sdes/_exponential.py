@@ -10,7 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._linalg import add, apply, compose, congruence, product, promote, semidefinite_cholesky, varying_like
+from .._linalg import (
+    add,
+    apply,
+    as_columns,
+    compose,
+    congruence,
+    product,
+    promote,
+    semidefinite_cholesky,
+    varying_like,
+)
 from .._types import RealScalar, State, Structured
 from ._base import AffineStep, Transition
 
@@ -114,10 +124,11 @@ def affine_step(
 ) -> AffineStep:
     """The step of dX = (A X + slope X + β) dt + σ dW, in which slope X + β is held."""
     one = jnp.ones((), beta.dtype)
-    growth, shift, S = flow(A, beta, a, dt)
-    operator = add(one, growth)
     if A.ndim < 2:
+        growth, shift, S = flow(A, beta, a, dt)
         held = compose(dt * _phi1(dt * A), slope)
     else:
-        _, held, _ = flow(A, promote(slope, 2, len(A)), 0 * one, dt)
-    return AffineStep(add(operator, held), shift, S)
+        columns = jnp.concatenate([promote(slope, 2, len(A)), as_columns(beta)], axis=1)
+        growth, moved, S = flow(A, columns, a, dt)
+        held, shift = moved[:, : len(A)], moved[:, len(A) :].reshape(beta.shape)
+    return AffineStep(add(add(one, growth), held), shift, S)

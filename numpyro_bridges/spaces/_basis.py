@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from math import sqrt
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -129,26 +129,25 @@ class FourierBasis(AbstractBasis):
         return fourier_functions(s, self.num_modes)
 
 
-class SineBasis(AbstractBasis):
-    """Functions on [0, length] that vanish at its ends (Dirichlet): coefficients of num_modes functions
+class AbstractIntervalBasis(AbstractBasis):
+    """Waves on [0, length] from some lowest number of half waves up to num_modes, orthonormal in L²(ds / length).
 
-        √2 sin(π s / length), √2 sin(2π s / length), ..., √2 sin(mπ s / length)      (m = num_modes),
-
-    orthonormal in L²(ds / length). The q points are midpoints of q equal parts.
+    The q points are midpoints of q equal parts.
 
     **Arguments:**
 
-    - `num_modes`: m.
+    - `num_modes`: m, the highest number of half waves.
     - `dim`: number of values at a point; 1 for a function.
     - `length`: of the interval.
     - `num_quadrature`: q, at least m + 1. With the default max(2m + 2, 32) the coefficients of a field that is cubic in
-        the function are exact (for the cosines too; a quadratic field of sines is no finite sum of sines).
+        the function are exact (a quadratic field of sines is no finite sum of sines).
     """
 
     num_modes: int = eqx.field(static=True)
     dim: int = eqx.field(static=True)
     length: float = eqx.field(static=True)
     num_quadrature: int = eqx.field(static=True)
+    lowest: eqx.AbstractClassVar[int]
 
     def __init__(self, num_modes: int, dim: int, *, length: float = 1.0, num_quadrature: int | None = None):
         self.num_modes = positive_integer(num_modes, "num_modes")
@@ -159,7 +158,7 @@ class SineBasis(AbstractBasis):
 
     @property
     def size(self) -> int:
-        return self.num_modes
+        return self.num_modes + 1 - self.lowest
 
     @property
     def laplacian(self) -> Float[Array, " n"]:
@@ -167,51 +166,35 @@ class SineBasis(AbstractBasis):
 
     @property
     def _wave_numbers(self) -> np.ndarray:
-        return np.pi / self.length * np.arange(1, self.num_modes + 1)
+        return np.pi / self.length * np.arange(self.lowest, self.num_modes + 1)
 
     def parameters(self, count: int) -> np.ndarray:
-        return _midpoints(count, self.length)
+        return self.length * (np.arange(count) + 0.5) / count
+
+
+class SineBasis(AbstractIntervalBasis):
+    """Functions on [0, length] that vanish at its ends (Dirichlet): coefficients of num_modes functions
+
+        √2 sin(π s / length), √2 sin(2π s / length), ..., √2 sin(mπ s / length)      (m = num_modes).
+
+    **Arguments:** those of `AbstractIntervalBasis`.
+    """
+
+    lowest: ClassVar[int] = 1
 
     def functions(self, s: ArrayLike) -> Any:
         return sqrt(2) * waves(s, self._wave_numbers)[1]
 
 
-class CosineBasis(AbstractBasis):
+class CosineBasis(AbstractIntervalBasis):
     """Functions on [0, length] without slope at its ends (Neumann): coefficients of num_modes + 1 functions
 
-        1, √2 cos(π s / length), √2 cos(2π s / length), ..., √2 cos(mπ s / length)      (m = num_modes),
+        1, √2 cos(π s / length), √2 cos(2π s / length), ..., √2 cos(mπ s / length)      (m = num_modes).
 
-    orthonormal in L²(ds / length). The q points are midpoints of q equal parts.
-
-    **Arguments:** those of `SineBasis`; `num_quadrature` is at least m + 1.
+    **Arguments:** those of `AbstractIntervalBasis`.
     """
 
-    num_modes: int = eqx.field(static=True)
-    dim: int = eqx.field(static=True)
-    length: float = eqx.field(static=True)
-    num_quadrature: int = eqx.field(static=True)
-
-    def __init__(self, num_modes: int, dim: int, *, length: float = 1.0, num_quadrature: int | None = None):
-        self.num_modes = positive_integer(num_modes, "num_modes")
-        self.dim = positive_integer(dim, "dim")
-        self.length = known_number(length, "length", "a positive number", lambda value: value > 0)
-        default = max(2 * self.num_modes + 2, 32)
-        self.num_quadrature = self._quadrature(num_quadrature, default, self.size, "num_modes + 1")
-
-    @property
-    def size(self) -> int:
-        return self.num_modes + 1
-
-    @property
-    def laplacian(self) -> Float[Array, " n"]:
-        return jnp.asarray(-(self._wave_numbers**2))
-
-    @property
-    def _wave_numbers(self) -> np.ndarray:
-        return np.pi / self.length * np.arange(self.num_modes + 1)
-
-    def parameters(self, count: int) -> np.ndarray:
-        return _midpoints(count, self.length)
+    lowest: ClassVar[int] = 0
 
     def functions(self, s: ArrayLike) -> Any:
         scale = np.where(np.arange(self.size) == 0, 1.0, sqrt(2))
@@ -270,7 +253,3 @@ class FourierSquare(AbstractBasis):
 def _frequencies(num_modes: int) -> np.ndarray:
     """0, 1, 1, 2, 2, ..., of the functions of a Fourier basis."""
     return (np.arange(2 * num_modes + 1.0) + 1) // 2
-
-
-def _midpoints(count: int, length: float) -> np.ndarray:
-    return length * (np.arange(count) + 0.5) / count
