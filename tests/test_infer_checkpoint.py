@@ -206,6 +206,12 @@ OTHER = {
         {"init_params": {"mean": 0.0, "wing_noise": np.zeros((1, 1, 1))}},
     ),
     r"extra_fields: \[\] there, \['energy'\] in": lambda: (sampler(), KEY, (DATUM,), {"extra_fields": ("energy",)}),
+    "`extra_fields` must be names of fields, .*; got 'i.x'": lambda: (
+        sampler(),
+        KEY,
+        (DATUM,),
+        {"extra_fields": ("i.x",)},
+    ),
     "kernel: HMC there, Counted in": lambda: (sampler(Counted), KEY, (DATUM,), {}),
     "kernel.target_accept_prob: 0.8 there, 0.9 in": lambda: (
         sampler(lambda model: hmc(model, target_accept_prob=0.9)),

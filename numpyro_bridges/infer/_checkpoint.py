@@ -131,6 +131,8 @@ class _Chains:
         init = _over_chains(mcmc, lambda x, _: self.sampler.init(x[0], mcmc.num_warmup, x[1], args, kwargs))
         start = jax.tree.map(_array, init((keys, jax.tree.map(jnp.asarray, init_params)), ()))
         self.start = _rebuilt(_named(_plain(start)), start)
+        for name in self.fields:
+            _require_field(self._first(self.start), name)
         leaves = jax.tree.leaves(_plain(self.start))
         self.fingerprint = np.array([np.sum(np.abs(x), dtype=float) for x in leaves])
         self.draw = jax.eval_shape(self._collect, self.start if self.batched else self._first(self.start))
@@ -222,6 +224,14 @@ def _over_chains(mcmc, fn, jit=lambda fn: fn):
         return jit(lambda x, common: method(lambda x: fn(x, common))(x))
     one, stack = jit(fn), partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
     return lambda x, common: stack(*[one(_chain(x, c), common) for c in range(mcmc.num_chains)])
+
+
+def _require_field(state, name) -> None:
+    try:
+        nested_attrgetter(name)(state)
+    except (AttributeError, IndexError, KeyError, TypeError) as e:
+        known = ", ".join(getattr(state, "_fields", ()))
+        raise ValueError(f"`extra_fields` must be names of fields, of {known}; got {name!r}.") from e
 
 
 def _chain(x, c):
