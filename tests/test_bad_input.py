@@ -436,7 +436,7 @@ def table() -> dict[str, Row]:
             x0=("array", X),
             match=("match", MATCH),
             tree=("tree", TREE),
-            num_steps=("count", 1),
+            num_steps=("count?", 1),  # of a linear SDE
             t0=("number", 0.5),
             guide="guide?",
             root_covariance=("array?", np.eye(len(X))),
@@ -1187,10 +1187,13 @@ def named(error, arguments: list[str], entry: Row) -> bool:
 
 
 def same(found, right) -> bool:
+    def near(a, b):
+        single = a.dtype == np.float32
+        scale = np.max(np.abs(b), initial=0.0, where=np.isfinite(b)) if single else 1e-3
+        return np.allclose(a.astype(float), b.astype(float), 1e-6, 1e-6 * scale, equal_nan=True)
+
     return len(found) == len(right) and all(
-        a.shape == b.shape
-        and np.allclose(a.astype(float), b.astype(float), 1e-6, 1e-9, equal_nan=True)
-        for a, b in zip(found, right, strict=True)
+        a.shape == b.shape and near(a, b) for a, b in zip(found, right, strict=True)
     )
 
 

@@ -103,6 +103,7 @@ def _by_node(tree: Tree, given: Any, name: str, whole: str, single: str) -> dict
     if given is None:
         return {}
     if isinstance(given, Mapping):
+        require(len(given) > 0, f"`{name}` must have an entry for at least one node; got none. Leave it out then.")
         numbered = {}
         for key, value in given.items():
             numbered[_number(tree, key, name)] = as_points(value, f"{name}[{key!r}]", single)
