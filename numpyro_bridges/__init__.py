@@ -5,11 +5,18 @@ from ._compare import Comparison as Comparison, compare as compare
 from .bridges import GuidedBridge as GuidedBridge
 from .conditioning import (
     AbstractCondition as AbstractCondition,
+    AbstractDensityMatch as AbstractDensityMatch,
     AbstractMatch as AbstractMatch,
+    CurrentMatch as CurrentMatch,
     CylinderSet as CylinderSet,
+    DensityMatch as DensityMatch,
     ExactMatch as ExactMatch,
+    HuberMatch as HuberMatch,
     InexactMatch as InexactMatch,
     IntervalCensored as IntervalCensored,
+    ProcrustesMatch as ProcrustesMatch,
+    StudentMatch as StudentMatch,
+    VarifoldMatch as VarifoldMatch,
 )
 from .distributions import (
     DiffusionEndpoint as DiffusionEndpoint,

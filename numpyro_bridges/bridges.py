@@ -8,6 +8,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -28,7 +29,7 @@ from .guiding import (
     retrace_reach,
     travel_continuous,
 )
-from .sdes import AbstractSDE, Frame, TimeGrid, still_frame, time_grid
+from .sdes import AbstractSDE, Flattened, Frame, TimeGrid, law_of_end, still_frame, time_grid
 
 Method = TypeVar("Method", bound=Callable)
 
@@ -94,6 +95,8 @@ class GuidedBridge(eqx.Module):
     clock: Float[Array, ""]
     guide: AbstractGuide
     solver: diffrax.AbstractSolver
+    flat: "GuidedBridge | None"
+    """The bridge that is computed where the condition is approximated: its states are those of this, flattened."""
 
     def __init__(
         self,
@@ -123,16 +126,25 @@ class GuidedBridge(eqx.Module):
         sde = sde.closed(grid.elapsed[0], x0)
         sde.check_state(x0)
         x0 = sde.start(x0)
+        condition = condition.closed(x0)
         condition.check(sde, x0)
+        clock = grid.clock(sde, x0)
+        condition = condition.anchored(sde, lambda: law_of_end(sde, x0, clock + grid.elapsed))
         if guide is None:
             guide = default_guide(sde, x0)
             guide = FrozenGuide() if solver is not None and isinstance(guide, FrozenGuide) else guide
         require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
-        guide.check(sde, x0)
         self.sde, self.condition, self.x0 = sde, condition, x0
-        self.guide = guide.closed(sde, x0, grid.elapsed)
-        self.grid, self.clock = grid, grid.clock(sde, x0)
+        self.grid, self.clock, self.flat = grid, clock, None
         self.solver = GuidedStep() if solver is None else solver
+        if condition.is_approximated and x0.ndim == 2:
+            flat = Flattened(sde, x0.shape[1])
+            self.guide = guide
+            self.flat = GuidedBridge(flat, condition, x0=x0.reshape(-1), ts=grid, guide=guide, solver=solver)
+            sde.check_end(lambda: condition.reference(sde, x0))
+            return
+        guide.check(sde, x0)
+        self.guide = guide.closed(sde, x0, grid.elapsed)
         self._check_solver()
         if condition.exact:
             self._check_exact()
@@ -228,17 +240,26 @@ class GuidedBridge(eqx.Module):
         """Both from one pass."""
         return self._run(noise)
 
-    def _split(self, noise):
-        """Rows that choose the target, rows that drive the steps; columns dropped for vector states."""
+    def _driving(self, noise):
         noise = as_float(noise, "noise").astype(self.x0.dtype)
         require(
             jnp.shape(noise) == self.noise_shape,
             f"`noise` must have shape {self.noise_shape}, one noise for one path; got {jnp.shape(noise)}. "
             "Use vmap for a batch.",
         )
+        return noise
+
+    def _split(self, noise):
+        """Rows that choose the target, rows that drive the steps; columns dropped for vector states."""
+        noise = self._driving(noise)
         noise = noise[..., 0] if self.x0.ndim == 1 else noise
         extra = self.condition.num_extra_noises
         return noise[:extra], noise[extra:]
+
+    def _drawn(self, extra) -> "GuidedBridge":
+        """With what the rows of extra noise choose of the condition."""
+        condition = self.condition.drawn(extra)
+        return self if condition is self.condition else eqx.tree_at(lambda b: b.condition, self, condition)
 
     def end(self) -> tuple[Observation, State]:
         """What is seen of the end state, and a state that meets the condition."""
@@ -313,6 +334,9 @@ class GuidedBridge(eqx.Module):
     @full_precision
     def _log_h_and_score(self, since, x: State) -> tuple[Float[Array, ""], State]:
         """The time is put into the grid behind t0; steps before it have no length and change nothing."""
+        if self.flat is not None:
+            value, score = self.flat._log_h_and_score(since, x.reshape(-1))
+            return value, score.reshape(x.shape)
         problem = self.problem(x, since)
         if not self._is_discrete:
             return self._value_and_score(problem, None, None, since, problem.frame.start)
@@ -324,6 +348,8 @@ class GuidedBridge(eqx.Module):
     @eqx.filter_jit
     @full_precision
     def _scores(self, path):
+        if self.flat is not None:
+            return self.flat._scores(path.reshape(len(path), -1)).reshape(-1, *self.x0.shape)
         problem, ts = self.problem(), self.grid.elapsed[:-1]
         y = path[:-1] - problem.frame.origins[:-1]
         if not self._is_discrete:
@@ -381,7 +407,11 @@ class GuidedBridge(eqx.Module):
     @eqx.filter_jit
     @full_precision
     def _run(self, noise):
+        if self.flat is not None:
+            path, log_weight = self.flat._run(self._driving(noise).reshape(self.flat.noise_shape))
+            return path.reshape(-1, *self.x0.shape), log_weight
         extra, noise = self._split(noise)
+        self = self._drawn(extra)
         problem = self.problem()
         frame, _, seen, reference, ts = problem
         plan = self._plan(problem)
@@ -395,7 +425,8 @@ class GuidedBridge(eqx.Module):
         path = frame.origins[1:] + path
         if self.condition.exact:  # to the last digit
             path = path.at[-1].set(self.condition.reference(self.sde, path[-1]))
-        return jnp.concatenate([self.x0[None], path]), log_weight + target.log_weight
+        log_weight = log_weight + target.log_weight + self.condition.correction(self.sde, path[-1])
+        return jnp.concatenate([self.x0[None], path]), log_weight
 
     @full_precision
     def guided_terms(
@@ -414,6 +445,10 @@ class GuidedBridge(eqx.Module):
         **Errors:** `ValueError` for a set, whose target is drawn, and for a bridge with another `solver`.
         """
         require(self._is_discrete, "`guided_terms` needs the guided step: the default `solver`.")
+        require(
+            self.flat is None,
+            "`guided_terms` are of the bridge `flat`, whose states are flattened: this condition is approximated.",
+        )
         _, noise = self._split(noise)
         frame, condition, _, _, ts = problem = self.problem()
         require(condition.num_extra_noises == 0, "`condition` is a set, whose target `guided_terms` does not draw.")
@@ -462,6 +497,12 @@ class GuidedBridge(eqx.Module):
     @eqx.filter_jit
     @full_precision
     def _retrace(self, path, key):
+        if self.flat is not None:
+            return self.flat._retrace(path.reshape(len(path), -1), key).reshape(self.noise_shape)
+        if self.condition.is_approximated and self.condition.num_extra_noises:
+            key_draw, key = (None, None) if key is None else jr.split(key)
+            shape = (1, self.noise_shape[1], *self.x0.shape[1:])
+            self = self._drawn(self.condition.draw_of(path[-1], shape, key_draw))
         problem = self.problem()
         frame, condition, seen, _, ts = problem
         plan = self._plan(problem)

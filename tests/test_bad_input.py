@@ -112,6 +112,10 @@ def drift(t, x, args):
     return -x
 
 
+def gaussian(x, observed, args):
+    return -jnp.sum((x - observed) ** 2)
+
+
 def constant(t, x, args):
     return 0.5
 
@@ -273,6 +277,31 @@ def table() -> dict[str, Row]:
         ),
         "CylinderSet": row(nb.CylinderSet, lower=("array", X - 1), upper=("array", X + 1)),
         "IntervalCensored": row(nb.IntervalCensored, cuts=("array", np.array([0.0, 1.0]))),
+        "DensityMatch": row(
+            nb.DensityMatch,
+            log_density=("function", gaussian),
+            args="free",
+            sample="function?",
+            spread=("number", 0.5),
+        ),
+        "StudentMatch": row(nb.StudentMatch, variance=("number", 0.5), degrees_of_freedom=("number", 4.0)),
+        "HuberMatch": row(nb.HuberMatch, variance=("number", 0.5), threshold=("number", 1.0)),
+        "ProcrustesMatch": row(nb.ProcrustesMatch, variance=("number", 0.5), up_to=("name", "rigid")),
+        "CurrentMatch": row(
+            nb.CurrentMatch,
+            variance=("number", 0.5),
+            length_scale=("number", 0.5),
+            closed_curve=("flag", True),
+            num_points="count? from 3",
+        ),
+        "VarifoldMatch": row(
+            nb.VarifoldMatch,
+            variance=("number", 0.5),
+            length_scale=("number", 0.5),
+            angle_scale=("number", 1.0),
+            closed_curve=("flag", True),
+            num_points="count? from 3",
+        ),
         "ExactMatch.at": row(nb.ExactMatch().at, observed=("array", X)),
         "InexactMatch.at": row(MATCH.at, observed=("array", X)),
         "IntervalCensored.at": row(

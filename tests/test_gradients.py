@@ -195,6 +195,34 @@ def pinned(p):
     return nb.CylinderSet(jnp.stack([p["pin"], p["lower"]]), jnp.stack([p["pin"], p["upper"]]))
 
 
+def quartic(p):
+    def log_density(x, observed, args):
+        square = jnp.sum((x - observed) ** 2)
+        return -square / args - square**2
+
+    return nb.DensityMatch(log_density, p["args"]).at(p["observed"])
+
+
+def student(p):
+    return nb.StudentMatch(p["variance"], p["degrees"]).at(p["observed"])
+
+
+def huber(p):
+    return nb.HuberMatch(p["variance"], p["threshold"]).at(p["observed"])
+
+
+def procrustes(p):
+    return nb.ProcrustesMatch(p["variance"]).at(p["observed"])
+
+
+def current(p):
+    return nb.CurrentMatch(p["variance"], p["width"]).at(p["observed"])
+
+
+def varifold(p):
+    return nb.VarifoldMatch(p["variance"], p["width"], p["angle"]).at(p["observed"])
+
+
 def brownian(p):
     return nb.BrownianMotion(p["Q"])
 
@@ -215,6 +243,8 @@ SQUARE = {"x0": np.linspace(-0.1, 0.2, 81), "observed": 0.1 * np.cos(np.arange(8
 PIN = {"x0": PLAIN["x0"], "t1": 1.2, "pin": 0.4, "lower": -0.2, "upper": 0.5}
 RANK_ONE = {"drift": B, "diffusion": B[:, 1:], "operator": np.array([[1.0, 0.5], [0.0, 1.0]])}
 
+OUTLINE = {"x0": TRIANGLE, "observed": np.array([[1.0, 0.1], [0.2, 1.2], [-0.7, -0.6]]), "t1": 1.2, "variance": 0.1}
+
 CASES = {
     "no rate": (linear, inexact, no_guide, PLAIN | RATE | {"shift": np.array([1.0, 0.2])}),
     "no rate, no noise": (linear, inexact, no_guide, PLAIN | DIAGONAL),
@@ -228,6 +258,12 @@ CASES = {
     "covariance": (brownian, inexact, no_guide, PLAIN | {"Q": MATRIX, "variance": 0.1 * MATRIX}),
     "exact": (linear, exact, unguided, FEW | RATE),
     "pinned": (linear, pinned, no_guide, PIN | RATE),
+    "density": (linear, quartic, no_guide, FEW | RATE | {"args": 0.4}),
+    "student": (linear, student, no_guide, PLAIN | RATE | {"degrees": 4.0}),
+    "huber": (linear, huber, no_guide, PLAIN | RATE | {"threshold": 1.0}),
+    "procrustes": (linear, procrustes, no_guide, OUTLINE | RATE),
+    "current": (linear, current, no_guide, OUTLINE | RATE | {"width": 0.9}),
+    "varifold": (linear, varifold, no_guide, OUTLINE | RATE | {"width": 0.9, "angle": 1.0}),
     "times": (clocked, inexact, no_guide, CLOCK | {"ts": np.array([0.4, 1.0, 1.3])}),
     "interval": (clocked, inexact, no_guide, CLOCK | {"t0": 0.4, "t1": 1.3}),
     "bins": (linear, bins, no_guide, FEW | RATE | CUTS),

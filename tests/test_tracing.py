@@ -73,6 +73,12 @@ def seen_by(datum):
     return lambda match: weight(PLAIN, match.at(datum))
 
 
+def quartic(x, observed, args):
+    """A log density that is none of a normal law."""
+    square = jnp.sum((x - observed) ** 2)
+    return -square / args - square**2
+
+
 def site_of(datum):
     """Of a match: the law of an observation, so that a model has it as a site."""
     return lambda match: observed(nb.DiffusionEndpoint(PLAIN, X0, match, ts=TS), datum)
@@ -242,6 +248,25 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
         nb.InexactMatch,
         {"variance": times(0.05), "operator": PICK, "normalised": False},
         seen_by(PICK @ SEEN),
+    ),
+    "DensityMatch": (
+        nb.DensityMatch,
+        {"log_density": quartic, "args": times(0.4), "sample": None, "spread": times(0.3)},
+        seen_by(SEEN),
+    ),
+    "StudentMatch": (nb.StudentMatch, {"variance": times(0.05), "degrees_of_freedom": times(4.0)}, seen_by(SEEN)),
+    "HuberMatch": (nb.HuberMatch, {"variance": times(0.05), "threshold": times(2.0)}, seen_by(SEEN)),
+    "ProcrustesMatch": (nb.ProcrustesMatch, {"variance": times(0.05), "up_to": "rigid"}, seen_by(SEEN)),
+    "CurrentMatch": (
+        nb.CurrentMatch,
+        {"variance": times(0.05), "length_scale": times(0.8), "closed_curve": False, "num_points": None},
+        seen_by(SEEN),
+    ),
+    "VarifoldMatch": (
+        nb.VarifoldMatch,
+        {"variance": times(0.05), "length_scale": times(0.8), "angle_scale": times(1.1)}
+        | {"closed_curve": True, "num_points": 4},
+        site_of(np.concatenate([SEEN, SEEN[:1] + 0.3])),
     ),
     "IntervalCensored": (
         nb.IntervalCensored,

@@ -5,7 +5,18 @@ from ._base import (
     Target as Target,
     lift as lift,
 )
+from ._curves import (
+    AbstractCurveMatch as AbstractCurveMatch,
+    CurrentMatch as CurrentMatch,
+    VarifoldMatch as VarifoldMatch,
+)
 from ._cylinder import CylinderSet as CylinderSet, IntervalCensored as IntervalCensored
+from ._density import (
+    AbstractDensityMatch as AbstractDensityMatch,
+    DensityCondition as DensityCondition,
+    DensityMatch as DensityMatch,
+)
+from ._distance import HuberMatch as HuberMatch, ProcrustesMatch as ProcrustesMatch, StudentMatch as StudentMatch
 from ._fused import fused as fused
 from ._match import ExactMatch as ExactMatch, InexactMatch as InexactMatch
 from ._message import (

@@ -6,9 +6,12 @@ value that a path is led to, which is the datum itself or, for a set, a draw ins
 """
 
 import abc
+from collections.abc import Callable
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._linalg import apply, congruence
@@ -48,6 +51,10 @@ class AbstractCondition(eqx.Module):
     num_extra_noises: eqx.AbstractClassVar[int]
     """Rows of noise that choose the target, before the first step."""
 
+    is_approximated: ClassVar[bool] = False
+    """Whether paths are led by an approximation, an observation of all columns of a state together: `anchored` finds it
+    and `correction` weighs it. It is of x.reshape(-1), where other observations are of each column alike."""
+
     @property
     @abc.abstractmethod
     def exact(self) -> bool:
@@ -76,6 +83,31 @@ class AbstractCondition(eqx.Module):
     @abc.abstractmethod
     def noise_from_target(self, law_mean: State, law_factor: Structured, seen: State) -> Float[Array, "extra m *dim"]:
         """The extra noise with which `target` chooses `seen`."""
+
+    def closed(self, x: State) -> "AbstractCondition":
+        """The same condition for states shaped like x, with what a user's functions read frozen as it is now."""
+        return self
+
+    def anchored(
+        self, sde: AbstractSDE, find_law: Callable[[], tuple[State, Structured]]
+    ) -> "AbstractCondition":
+        """The condition with the observation that paths are led by, where it has none of itself.
+
+        `find_law()` gives mean and covariance, nearly, of the unconditioned end state.
+        """
+        return self
+
+    def drawn(self, extra: Float[Array, "extra k *dim"]) -> "AbstractCondition":
+        """The condition with what the rows of extra noise choose of it, before a path is led."""
+        return self
+
+    def draw_of(self, x: State, shape: tuple[int, ...], key: PRNGKeyArray | None) -> Float[Array, "extra k *dim"]:
+        """Rows of extra noise for `drawn`, `shape`, of a path that is known, with the end state x."""
+        return jnp.zeros(shape, x.dtype)
+
+    def correction(self, sde: AbstractSDE, x: State) -> Float[Array, ""]:
+        """Log density, at the end state x, of the condition less that of the observation that paths are led by."""
+        return jnp.zeros((), x.dtype)
 
     def displaced(self, shift: State) -> "AbstractCondition":
         """The condition on what is seen less `shift`; here by adding it again, which costs digits."""
@@ -127,6 +159,14 @@ class AbstractMatch(eqx.Module):
     @abc.abstractmethod
     def sample(self, key: PRNGKeyArray, sde: AbstractSDE, x: State) -> Array:
         """An observation of the end state x."""
+
+    def closed(self, x: State, observed: State) -> Self:
+        """The same match for states like x and data like `observed`, with what a user's functions read frozen."""
+        return self
+
+    def example(self, sde: AbstractSDE, x: State) -> Array:
+        """A datum that could be seen of the state x: for its shape, and where the real one is masked."""
+        return self.sample(jr.key(0), sde, x)
 
     @abc.abstractmethod
     def check_density(self) -> None:

@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jaxtyping import Array
 
 from .._checks import as_float, concrete, exact_float, require, require_finite, require_instance, words
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
-from ..conditioning import AbstractMatch
+from ..conditioning import AbstractDensityMatch, AbstractMatch
 from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE, simulate, time_grid
 from ._batch import as_shape, find_batched, one_of
@@ -81,7 +82,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         parts = {"sde": sde, "x0": x0, "match": match, "guide": guide}
         names = find_batched(parts, batch_shape, batched, check_law)
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
-        datum = jnp.zeros(seen_shape(one))
+        datum = example(one)
         exact = one["match"].at(datum).exact
         given = {"t0": t0, "t1": t1, "ts": ts}
         times = {k: value if value is None else exact_float(value, k) for k, value in given.items()}
@@ -89,7 +90,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         names += ("ts",) if own else ()
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
         close_parts(parts, one, names, len(batch_shape), one["ts"].elapsed)
-        noise_shape = _bridge(one, datum).noise_shape
+        noise_shape = _noise_shape(one, datum)
         declared = batched is not None
         plain = ("ts",) if ts is None else ()
         super().__init__(parts, names, declared, batch_shape, datum.shape, noise_shape, validate_args, plain)
@@ -128,7 +129,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
 
     @staticmethod
     def _placeholder(parts, value):
-        return parts["match"].sample(jr.key(0), parts["sde"], parts["x0"]).astype(value.dtype)
+        return parts["match"].example(parts["sde"], parts["x0"]).astype(value.dtype)
 
     @staticmethod
     def _check_data(parts, values):
@@ -198,8 +199,18 @@ def close_parts(parts, one, names, num_axes, ts, several=()) -> None:
 
     x0 = one["x0"]
     set_closed("sde", lambda sde: sde.closed(ts[0], x0))
+    if isinstance(one["match"], AbstractDensityMatch):
+        datum = example(one)
+        set_closed("match", lambda match: match.closed(x0, datum))
     if parts["guide"] is not None:
         set_closed("guide", lambda guide: guide.closed(one["sde"], x0, ts))
+
+
+def _noise_shape(parts, datum) -> tuple[int, ...]:
+    if not isinstance(parts["match"], AbstractDensityMatch):
+        return _bridge(parts, datum).noise_shape
+    # its approximation, which takes a while, is that of another datum
+    return eqx.filter_eval_shape(lambda *a: jnp.zeros(_bridge(*a).noise_shape), parts, datum).shape
 
 
 def _path(parts, value, noise):
@@ -212,15 +223,23 @@ def _free_path(parts, key):
     return simulate(sde, x0, grid, jr.normal(key, shape, x0.dtype))
 
 
+def example(parts) -> Array:
+    """A datum for what is known before there is one: zeros, where a match may be made at them."""
+    match = parts["match"]
+    if isinstance(match, AbstractDensityMatch):
+        return match.example(parts["sde"], parts["x0"])
+    return jnp.zeros(seen_shape(parts))
+
+
 def seen_shape(parts) -> tuple[int, ...]:
     """Shape of what is seen, by tracing one step and its observation."""
 
-    def seen(t0, t1, x0, key):
+    def seen(t0, t1, x0):
         sde = parts["sde"]
-        return parts["match"].sample(key, sde, sde.transition(t0, t1, x0).mean)
+        return parts["match"].example(sde, sde.transition(t0, t1, x0).mean)
 
     time = jax.ShapeDtypeStruct((), parts["x0"].dtype)  # no number: a coefficient may be defined on [t0, t1] only
-    return jax.eval_shape(seen, time, time, parts["x0"], jr.key(0)).shape
+    return jax.eval_shape(seen, time, time, parts["x0"]).shape
 
 
 def check_law(parts):

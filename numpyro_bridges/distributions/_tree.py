@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from .._checks import (
     as_float,
@@ -28,14 +28,15 @@ from .._checks import (
     require_instance,
     words,
 )
+from .._linalg import promote, symmetric
 from .._types import RealScalar, State
-from ..conditioning import AbstractMatch, fused
-from ..guiding import AbstractGuide
-from ..sdes import AbstractSDE, as_covariance
+from ..conditioning import AbstractDensityMatch, AbstractMatch, fused
+from ..guiding import AbstractGuide, default_guide
+from ..sdes import AbstractSDE, Flattened, as_covariance, for_every_column
 from ..trees import Root, Tree, TreeProblem
 from ._batch import as_shape, find_batched, one_of
 from ._driving_noise import NoiseBlocks
-from ._endpoint import check_law, close_parts, names_of, seen_shape
+from ._endpoint import check_law, close_parts, example, names_of
 from ._noise_driven import AbstractNoiseDriven
 
 
@@ -145,9 +146,10 @@ class DiffusionTree(AbstractNoiseDriven):
         parts["root_covariance"] = prior
         names = find_batched(parts, batch_shape, declared, _check)
         one = _simplest(one_of(parts, names, batch_shape, (0,) * len(batch_shape)))
-        datum = jnp.zeros((len(tree.observed), *seen_shape(one)))
+        datum = _examples(one)
         _check_condition(one, datum)
-        close_parts(parts, one, names, len(batch_shape), jnp.linspace(0.0, 1.0, settings.steps_together + 1), own_edges)
+        ts = jnp.linspace(0.0, 1.0, settings.steps_together + 1)
+        close_parts(parts, one, names, len(batch_shape), ts, own + own_edges)
         num_steps_in_all = sum(settings.num_steps[node - 1] for node in tree.active)
         columns = one["x0"].shape[1] if one["x0"].ndim == 2 else 1
         k = one["sde"].noise_size(one["x0"])
@@ -223,7 +225,8 @@ class DiffusionTree(AbstractNoiseDriven):
     def _simulate(parts, key):
         seen, paths = _simulated(parts, key)
         noise = _problem(parts, seen).noise_from_paths(paths, jr.fold_in(key, 2))
-        return seen, noise if noise.ndim == 3 else noise[..., None]
+        columns = parts["x0"].shape[1] if parts["x0"].ndim == 2 else 1
+        return seen, noise.reshape(len(noise), -1, columns)
 
     @staticmethod
     def _log_weight(parts, value, noise):
@@ -260,6 +263,12 @@ def _counts(num_steps, tree: Tree) -> tuple[int, ...]:
     if several:
         return positive_integers(num_steps, "num_steps", count, "branches")
     return (positive_integer(num_steps, "num_steps"),) * count
+
+
+def _examples(parts) -> Array:
+    """Data for what is known before there are any; `parts` of the law of one node and one branch."""
+    one = example(parts)
+    return jnp.broadcast_to(one, (len(parts["tree"].observed), *one.shape))
 
 
 def _simplest(parts):
@@ -303,20 +312,20 @@ def _check_axis(part, size, why, what):
 def _check_condition(parts, datum):
     tree, condition = parts["tree"], parts["match"].at(datum[0])
     require(
-        condition.num_extra_noises == 0,
+        condition.num_extra_noises == 0 or condition.is_approximated,
         "`match` must see a value at each node, such as `InexactMatch(variance)`: branches are not led to sets.",
     )
-    if not condition.exact:
+    if not (condition.exact or condition.is_approximated):
         return
     twice = len(tree.observed) - len(set(tree.observed))
     require(
         not twice,
-        f"`match` must have an error where nodes have several rows, and {twice} rows are of nodes that have one "
-        "already: use an `InexactMatch`, of the variance within species.",
+        f"`match` must have a Gaussian error where nodes have several rows, and {twice} rows are of nodes that have "
+        "one already: use an `InexactMatch`, of the variance within species.",
     )
     inner = [node for node in tree.observed if node not in tree.tips]
     require(
-        not inner,
+        not (condition.exact and inner),
         f"`match` must have an error where inner nodes are seen, and {len(inner)} of the seen nodes are no tips: use "
         "an `InexactMatch` of a small variance.",
     )
@@ -340,8 +349,41 @@ def _unled(parts, value) -> TreeProblem:
         conditions = fused(match, value, sizes, own, sde, x0)
     else:
         conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(match, value)
+    if conditions.is_approximated:
+        conditions = _anchored(parts, sde, tree, conditions)
+    guide, root = parts["guide"], _root(parts)
+    if _is_flat(parts):
+        guide = default_guide(sde, x0) if guide is None else guide
+        dim = x0.shape[1]
+        sde, sdes = (s if s is None else Flattened(s, dim) for s in (sde, sdes))
+        factor = root.factor if root.factor is None else for_every_column(root.factor, dim)
+        root = Root(x0.reshape(-1), factor, x0.reshape(-1))
     num_steps = settings.steps_together
-    return TreeProblem.of(sde, parts["guide"], _root(parts), tree, conditions, num_steps, parts["t0"], sdes)
+    return TreeProblem.of(sde, guide, root, tree, conditions, num_steps, parts["t0"], sdes)
+
+
+def _anchored(parts, sde: AbstractSDE, tree: Tree, conditions):
+    """Conditions with the observations that paths are led by: near where a Brownian motion would be at each node."""
+    x0, prior = parts["x0"], parts["root_covariance"]
+    n = x0.shape[0]
+    a = promote(sde.covariance(parts["t0"], x0), 2, n)
+    at_root = jnp.zeros_like(a) if prior is None else promote(symmetric(prior).astype(x0.dtype), 2, n)
+
+    def anchored(condition, depth):
+        return condition.anchored(sde, lambda: (x0, at_root + depth * a))
+
+    nodes = np.array(list(dict.fromkeys(tree.observed)))
+    return jax.vmap(anchored)(conditions, tree.depths[nodes])
+
+
+def _is_flat(parts) -> bool:
+    """Whether what is computed has states that are those of the law, flattened."""
+    return isinstance(parts["match"], AbstractDensityMatch) and parts["x0"].ndim == 2
+
+
+def _unflat(parts, states):
+    """States as the law has them."""
+    return states.reshape(*states.shape[:-1], *parts["x0"].shape) if _is_flat(parts) else states
 
 
 def _divided(parts) -> Tree:
@@ -369,6 +411,8 @@ def _root(parts) -> Root:
 
 def _driving(parts, noise):
     """Noise as the sweep takes it: a vector state has no columns."""
+    if _is_flat(parts):
+        return noise.reshape(len(noise), -1)
     return noise[..., 0] if parts["x0"].ndim == 1 else noise
 
 
@@ -383,18 +427,17 @@ def _times(parts):
 
 
 def _without_data(parts) -> TreeProblem:
-    """The problem of data that are all 0: for what does not depend on them."""
-    shape = len(parts["tree"].observed), *seen_shape(_simplest(parts))
-    return _unled(parts, jnp.zeros(shape, parts["x0"].dtype))
+    """The problem of some data: for what does not depend on them."""
+    return _unled(parts, _examples(_simplest(parts)).astype(parts["x0"].dtype))
 
 
 def _paths(parts, value, noise):
-    return _along(parts, _problem(parts, value).paths(_driving(parts, noise)))
+    return _along(parts, _unflat(parts, _problem(parts, value).paths(_driving(parts, noise))))
 
 
 def _nodes(parts, value, noise):
     problem = _problem(parts, value)
-    states = problem.at_nodes(problem.paths(_driving(parts, noise)))
+    states = _unflat(parts, problem.at_nodes(problem.paths(_driving(parts, noise))))
     return states[np.concatenate([[0], np.cumsum(parts["settings"].pieces)])]
 
 
@@ -406,7 +449,8 @@ def _simulated(parts, key):
     sde, x0 = problem.sde, problem.x0
     shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])
     paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))
-    ends = problem.at_nodes(paths)[np.array(tree.observed)]
+    ends = _unflat(parts, problem.at_nodes(paths)[np.array(tree.observed)])
+    sde = parts["sde"] if "sde" not in parts["settings"].per_edge else _first(parts["sde"])
     keys = jr.split(key_seen, len(ends))
     draw = jax.vmap(lambda match, key, x: match.sample(key, sde, x), in_axes=(0 if "match" in own else None, 0, 0))
     return draw(match, keys, ends), paths

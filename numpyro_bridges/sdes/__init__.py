@@ -7,6 +7,7 @@ from ._base import (
     divergence as divergence,
     still_frame as still_frame,
 )
+from ._flattened import Flattened as Flattened, for_every_column as for_every_column
 from ._grid import TimeGrid as TimeGrid, time_grid as time_grid
 from ._kunita import KunitaFlow as KunitaFlow
 from ._linear import BrownianMotion as BrownianMotion, LinearSDE as LinearSDE, as_covariance as as_covariance
@@ -19,4 +20,4 @@ from ._noise import (
 )
 from ._sde import SDE as SDE
 from ._semilinear import SemilinearSDE as SemilinearSDE
-from ._simulate import simulate as simulate
+from ._simulate import law_of_end as law_of_end, simulate as simulate

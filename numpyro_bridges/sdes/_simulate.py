@@ -1,11 +1,11 @@
-"""Paths of the time-discretised model, unconditioned."""
+"""The time-discretised model, unconditioned: its paths, and the law of their end."""
 
 import jax
 import jax.numpy as jnp
 
 from .._checks import as_float, floating, require, require_instance
-from .._linalg import apply, columns, full_precision, varying_like
-from .._types import Noise, State
+from .._linalg import add, apply, columns, congruence, full_precision, varying_like
+from .._types import Noise, State, Structured
 from ._base import AbstractSDE, Displaced
 from ._grid import given_grid
 
@@ -46,3 +46,23 @@ def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
     start = varying_like(jnp.zeros_like(x0), displaced, times, noise)
     _, path = jax.lax.scan(step, start, (times[:-1], times[1:], noise))
     return jnp.concatenate([x0[None], x0[None] + path])
+
+
+def law_of_end(sde: AbstractSDE, x0: State, ts) -> tuple[State, Structured]:
+    """Mean and covariance `(n, n)` of the end state, the SDE linearised along its path without noise.
+
+    **Arguments:** `ts` `(K + 1,)`: times as the SDE sees them.
+    """
+    ts = jnp.asarray(ts, x0.dtype)
+
+    def step(carry, inputs):
+        x, S = carry
+        t0, t1 = inputs
+        linear = sde.linearised_step(t0, t1, x)
+        S = add(congruence(linear.operator, S), linear.covariance)
+        return (sde.transition(t0, t1, x).mean, S), None
+
+    n = x0.shape[0]
+    start = varying_like((x0, jnp.zeros((n, n), x0.dtype)), sde, ts)
+    end, _ = jax.lax.scan(step, start, (ts[:-1], ts[1:]))
+    return end

@@ -160,7 +160,7 @@ class TreeProblem(eqx.Module):
     def is_exact(self) -> bool:
         """Whether the messages are those of the process itself, so that Ψ depends on no noise."""
         frozen = isinstance(self.guide, FrozenGuide) and self.guide.auxiliary is None
-        return self.sde.has_exact_transition and frozen
+        return self.sde.has_exact_transition and frozen and not self.conditions.is_approximated
 
     @full_precision
     def log_weight(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, ""]:
@@ -505,6 +505,9 @@ class TreeProblem(eqx.Module):
             return jnp.concatenate([x[None], branch.anchor[None] + path]), log_weight
 
         end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
+        if self.conditions.is_approximated:
+            correction = jax.vmap(lambda condition, x: condition.correction(self.sde, x))
+            end_weights = end_weights + correction(self._rows(ends), end_paths[:, -1])
         paths = jnp.zeros((len(schedule.active), K + 1, *self.x0.shape), self.x0.dtype)
         paths = paths.at[at_ends].set(end_paths).at[at_inner].set(inner_paths)
         densities = self._log_density_inside(known)
@@ -523,7 +526,8 @@ class TreeProblem(eqx.Module):
 
         def one(condition, x):
             seen = condition.observation(self.sde, x)
-            return condition.log_value(apply(seen.operator, x), seen.factor) + seen.log_scale
+            log_density = condition.log_value(apply(seen.operator, x), seen.factor) + seen.log_scale
+            return log_density + condition.correction(self.sde, x)
 
         rows = self._rows([inner[i] for i in chosen])
         densities = jax.vmap(one)(rows, states[np.array(chosen)])

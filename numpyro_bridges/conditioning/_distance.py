@@ -1,0 +1,179 @@
+"""Matches that are functions of a distance in the H-norm: of heavy tails, and to a shape wherever it lies.
+
+With r² = Σ_i w_i |x_i − v_i|² / variance, m numbers in all and w the weights of the space,
+
+    Student    c (1 + r²/ν)^{−(ν + m)/2}
+    Huber      c exp(−ρ(r)),    ρ(r) = r²/2 up to the threshold k, k r − k²/2 beyond.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.random as jr
+from jax.scipy.special import gammainc, gammaincc, gammaln, polygamma
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .._checks import choice, require
+from .._linalg import rows
+from .._types import State
+from ..sdes import AbstractSDE
+from ._density import AbstractDensityMatch, positive
+
+_LOG_PI = 1.1447298858494002
+
+
+class StudentMatch(AbstractDensityMatch):
+    """The end state is seen with an error from a multivariate Student distribution: `InexactMatch` with heavy tails.
+
+    All numbers of a datum share one scale of the error, drawn anew for each datum, so that a datum that
+    lies far off counts less.
+
+    **Arguments:** `variance`: as of `InexactMatch`, a number, at infinitely many degrees of freedom.
+    `degrees_of_freedom`: ν, positive.
+    """
+
+    variance: Float[Array, ""]
+    degrees_of_freedom: Float[Array, ""]
+
+    def __init__(self, variance, degrees_of_freedom):
+        self.variance = positive(variance, "variance")
+        self.degrees_of_freedom = positive(degrees_of_freedom, "degrees_of_freedom")
+
+    @property
+    def spread(self):
+        """That of the logarithm of the precision of the error, which has the law of Gamma(ν/2)."""
+        return jnp.sqrt(polygamma(1, 0.5 * self.degrees_of_freedom))
+
+    def log_density(self, sde, x, observed):
+        square, log_scale = _square(self.variance, sde, x, observed)
+        nu = self.degrees_of_freedom.astype(x.dtype)
+        half = 0.5 * (nu + x.size)
+        constant = gammaln(half) - gammaln(0.5 * nu) - 0.5 * x.size * (jnp.log(nu) + _LOG_PI)
+        return constant - log_scale - half * jnp.log1p(square / nu)
+
+    def precision(self, sde, x, observed):
+        square, _ = _square(self.variance, sde, x, observed)
+        nu = self.degrees_of_freedom.astype(x.dtype)
+        return _reweighted((nu + x.size) / (nu + square), self.variance, sde, x)
+
+    def sample(self, key: PRNGKeyArray, sde: AbstractSDE, x: State) -> Array:
+        key_error, key_scale = jr.split(key)
+        nu = self.degrees_of_freedom.astype(x.dtype)
+        precision = jr.gamma(key_scale, 0.5 * nu, dtype=x.dtype) / (0.5 * nu)
+        error = jr.normal(key_error, x.shape, x.dtype) / jnp.sqrt(precision)
+        return x + rows(jnp.sqrt(self.variance.astype(x.dtype) / _weights(sde, x)), x) * error
+
+
+class HuberMatch(AbstractDensityMatch):
+    """The end state is seen with an error whose density is normal near 0 and falls exponentially far away.
+
+    **Arguments:** `variance`: as of `InexactMatch`, a number. `threshold`: k, the distance, in standard deviations,
+    from which on the loss is linear. In many numbers m the distance is about √m.
+    """
+
+    variance: Float[Array, ""]
+    threshold: Float[Array, ""]
+
+    def __init__(self, variance, threshold=1.345):
+        self.variance = positive(variance, "variance")
+        self.threshold = positive(threshold, "threshold")
+
+    @property
+    def spread(self):
+        return jnp.asarray(1.0)
+
+    def log_density(self, sde, x, observed):
+        square, log_scale = _square(self.variance, sde, x, observed)
+        k, m = self.threshold.astype(x.dtype), x.size
+        far = square > k * k
+        distance = jnp.sqrt(jnp.where(far, square, 1.0))
+        loss = jnp.where(far, k * distance - 0.5 * k * k, 0.5 * square)
+        # the integral over R^m in spherical coordinates, r < k and r > k
+        area = jnp.log(2.0) + 0.5 * m * _LOG_PI - gammaln(0.5 * m)
+        inner = (0.5 * m - 1) * jnp.log(2.0) + gammaln(0.5 * m) + jnp.log(gammainc(0.5 * m, 0.5 * k * k))
+        outer = 0.5 * k * k - m * jnp.log(k) + gammaln(1.0 * m) + jnp.log(gammaincc(1.0 * m, k * k))
+        return -loss - log_scale - area - jnp.logaddexp(inner, outer)
+
+
+    def precision(self, sde, x, observed):
+        square, _ = _square(self.variance, sde, x, observed)
+        k = self.threshold.astype(x.dtype)
+        far = square > k * k
+        return _reweighted(jnp.where(far, k / jnp.sqrt(jnp.where(far, square, 1.0)), 1.0), self.variance, sde, x)
+
+
+class ProcrustesMatch(AbstractDensityMatch):
+    """ψ(x) = exp(−d²/2 variance), d the H-norm distance of x to a shape wherever it lies: a set of states.
+
+    d is the least distance over all motions of the datum. It is a kernel and no density of the datum.
+
+    **Arguments:** `variance`: as of `InexactMatch`, a number. `up_to`: the motions: `"translation"`, `"rigid"`, with
+    rotations, or `"similarity"`, with scale too. Reflections are none of them. Shapes in the plane or in space.
+    """
+
+    variance: Float[Array, ""]
+    up_to: str = eqx.field(static=True)
+
+    def __init__(self, variance, up_to: str = "similarity"):
+        self.variance = positive(variance, "variance")
+        self.up_to = choice(up_to, "up_to", ("translation", "rigid", "similarity"))
+
+    def log_density(self, sde, x, observed):
+        dims = (1, 2, 3) if self.up_to == "translation" else (2, 3)
+        require(
+            x.ndim == 2 and x.shape[1] in dims and sde.space is None or hasattr(sde.space, "num_points"),
+            f"`x0` must hold points in the plane or in space, (n, 2) or (n, 3); got {x.shape} in {sde.space}.",
+        )
+        weights = _weights(sde, x)
+        v = _centred(weights, _like(observed, x))
+        x = _centred(weights, x)
+        own, other = jnp.sum(x * x), jnp.sum(v * v)
+        if self.up_to == "translation":
+            square = jnp.sum((x - v) ** 2)
+        elif self.up_to == "rigid":
+            square = own + other - 2 * _largest_trace(v.T @ x)
+        else:
+            square = own - _largest_trace(v.T @ x) ** 2 / other
+        return -0.5 * square / self.variance.astype(x.dtype)
+
+
+def _largest_trace(A: Float[Array, "d d"]) -> Float[Array, ""]:
+    """max tr(R A) over rotations R."""
+    if len(A) == 2:
+        return jnp.sqrt((A[0, 0] + A[1, 1]) ** 2 + (A[0, 1] - A[1, 0]) ** 2)
+    U, s, Vt = jnp.linalg.svd(A)
+    return jnp.sum(s) - (1 - jnp.linalg.det(U @ Vt)) * s[-1]
+
+
+def _centred(weights: Float[Array, " n"], x: State) -> State:
+    """√w (x − the mean of x)."""
+    w = rows(weights, x)
+    return jnp.sqrt(w) * (x - jnp.sum(w * x, axis=0, keepdims=True) / jnp.sum(w))
+
+
+def _weights(sde: AbstractSDE, x: State) -> Float[Array, " n"]:
+    n = x.shape[0]
+    return jnp.ones((n,), x.dtype) if sde.space is None else sde.space.weights.astype(x.dtype)
+
+
+def _square(variance, sde: AbstractSDE, x: State, observed: State):
+    """r², and the logarithm of the product of all √(variance/w)."""
+    weights = _weights(sde, x)
+    variance = variance.astype(x.dtype)
+    difference = x - _like(observed, x)
+    square = jnp.sum(rows(weights, x) * difference * difference) / variance
+    log_scale = 0.5 * (x.size / x.shape[0]) * jnp.sum(jnp.log(variance / weights))
+    return square, log_scale
+
+
+def _reweighted(weight: Array, variance: Array, sde: AbstractSDE, x: State) -> Float[Array, "N N"]:
+    """The precision of least squares that are weighted again and again: ψ' of the slope, the same in all directions."""
+    precision = weight * _weights(sde, x) / variance.astype(x.dtype)
+    return jnp.diag(jnp.repeat(precision, x.size // x.shape[0]))
+
+
+def _like(observed: State, x: State) -> State:
+    require(
+        observed.shape == x.shape,
+        f"`observed` must be shaped like a state, {x.shape}; got {observed.shape}.",
+    )
+    return observed.astype(x.dtype)
