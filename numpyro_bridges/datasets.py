@@ -99,14 +99,14 @@ def ellipses(num_points: int = 32, aspects: Sequence[float] = (1.0, 1.25, 1.5, 2
     **Arguments:**
 
     - `num_points`: of each outline, at least 3.
-    - `aspects`: positive ratios of the x-axis to the y-axis.
+    - `aspects`: ratios of the x-axis to the y-axis, from 1e-6 to 1e6.
 
     **Returns:** `Shapes`.
     """
     num_points = positive_integer(num_points, "num_points", least=3)
     ratios = known_float(aspects, "aspects")
-    if ratios.ndim != 1 or ratios.size == 0 or not np.all(np.isfinite(ratios) & (ratios > 0.0)):
-        raise ValueError(f"`aspects` must be one or more positive ratios, got {words(aspects)}.")
+    if ratios.ndim != 1 or ratios.size == 0 or not np.all((ratios >= 1e-6) & (ratios <= 1e6)):
+        raise ValueError(f"`aspects` must be one or more ratios from 1e-6 to 1e6; got {words(aspects)}.")
     angles = np.linspace(0.0, 2.0 * np.pi, 100 * num_points, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     labels = tuple(f"{aspect:g}" for aspect in ratios)

@@ -890,6 +890,8 @@ EXTENSION = {
         "log_value",
         "target",
         "noise_from_target",
+        "closed",
+        "example",
         "check_density",
         "sample",
     ),
@@ -1281,7 +1283,7 @@ def test_random_bad_input(name, request):
     chosen = settings(
         max_examples=examples,
         derandomize=more is None,
-        deadline=30_000,
+        deadline=120_000,  # a model may have to be compiled
         database=None,
         suppress_health_check=checks,
     )

@@ -124,5 +124,5 @@ def test_too_few_points(make):
 
 @pytest.mark.parametrize("aspects", [(), (1.0, 0.0)])
 def test_wrong_aspects(aspects):
-    with pytest.raises(ValueError, match="`aspects` must be one or more positive ratios"):
+    with pytest.raises(ValueError, match="`aspects` must be one or more ratios from 1e-6"):
         datasets.ellipses(aspects=aspects)

@@ -165,7 +165,7 @@ def score_field(
     if length is None:
         length = 0.25 * float(np.ptp(seen(points), axis=0).max())
     length = known_number(length, "length", "a number from 0 on", lambda value: value >= 0)
-    longest = np.linalg.norm(arrows, axis=1).max()
+    longest = np.nanmax(np.linalg.norm(arrows, axis=1), initial=0.0)
     drawn = arrows * (length / longest if longest > 0.0 else 0.0)
     ax = shape_axes(ax, np.concatenate([points, points + drawn]))
     draw(ax, points[None], closed, colors=NEUTRAL, linewidths=1.2, zorder=1)

@@ -258,6 +258,10 @@ class Tree(eqx.Module):
             f"`rates` must be one number, or one for each branch, {self.lengths.shape}; got shape {rates.shape}. "
             "`tree.clade(...)` says which branches belong to a clade.",
         )
+        require(
+            jnp.all(jnp.isfinite(rates) & (rates >= 0)),
+            f"`rates` must be finite and at least 0; got {words(concrete(rates))}. Lengths are times.",
+        )
         return self.with_lengths(self.lengths * rates)
 
     def clade(self, *names: str, stem: bool = True) -> np.ndarray:
