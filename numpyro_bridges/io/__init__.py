@@ -1,5 +1,6 @@
-"""Reading and writing of landmarks and outlines as lists of `Specimen`: files of tpsDig, CSV tables, 3D Slicer, NTS and
-Morphologika; sets of specimens as arrays, and with what a second table says of them."""
+"""Reading and writing of landmarks and outlines as lists of `Specimen`: files of tpsDig, CSV
+tables, 3D Slicer, NTS and Morphologika; sets of specimens as arrays, and with what a second table
+says of them."""
 
 from ._csv import read_csv as read_csv, write_csv as write_csv
 from ._morphologika import read_morphologika as read_morphologika

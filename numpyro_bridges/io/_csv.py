@@ -1,7 +1,6 @@
 """Landmarks and outlines in CSV tables.
-
-A wide table has one row for a specimen, with columns id, x1, y1, x2, y2, ...; a long one has one row for a
-point, with columns id, point, x, y.
+ A wide table has one row for a specimen, with columns id, x1, y1, x2, y2, ...; a long one has one
+row for a point, with columns id, point, x, y.
 """
 
 import csv
@@ -30,7 +29,8 @@ from ._specimen import (
 )
 
 _DELIMITERS = ("\t", ";", "|", ",", " ")
-"""In the order in which they are looked for: names and numbers may have commas and blanks in them."""
+"""In the order in which they are looked for: names and numbers may have commas and blanks in
+them."""
 
 _SEPARATED = r"[\s._-]*"
 _NUMBERED = (  # in lower case; what comes before tells several sets of columns apart
@@ -40,7 +40,7 @@ _NUMBERED = (  # in lower case; what comes before tells several sets of columns 
 """x1, X01, raw.x_1; and 1_x, 1.X, LM1x."""
 
 _COUNTED = re.compile(
-    rf"(?P<set>(?:(?:raw|proc|procrustes){_SEPARATED})?coord)(?:inate)?s?{_SEPARATED}(?P<number>\d+)"
+    rf"(?P<set>((raw|proc|procrustes){_SEPARATED})?coord)(inate)?s?{_SEPARATED}(?P<number>\d+)"
 )
 """RawCoord1: coordinates numbered through."""
 
@@ -63,37 +63,44 @@ def read_csv(
 ) -> list[Specimen]:
     """Specimens of a CSV table with a header, in wide or long layout.
 
-    *Wide*: columns x1, y1, ..., xn, yn (or x1, y1, z1, ...; numbering may begin at 0), in any order. Upper case,
-    leading zeros, the number in front (`1_x`, `1.X`, `LM1_x`), names for numbers (`nasion_x`, in the order in which
-    they come) and coordinates numbered through (`RawCoord1`) are read as well. *Long*: columns x, y (and z).
-    Further columns go to `Specimen.notes`, in the long layout those that are constant within each specimen.
+    *Wide*: columns x1, y1, ..., xn, yn (or x1, y1, z1, ...; numbering may begin at 0), in any
+    order. Upper case, leading zeros, the number in front (`1_x`, `1.X`, `LM1_x`), names for numbers
+    (`nasion_x`, in the order in which they come) and coordinates numbered through (`RawCoord1`) are
+    read as well. *Long*: columns x, y (and z). Further columns go to `Specimen.notes`, in the long
+    layout those that are constant within each specimen.
 
-    Empty cells and columns at the end do not matter. A first column without a name holds the names of the rows,
-    which in a wide table without a column `id` are those of the specimens. Two columns of numbers without a header
-    are the points of one specimen, which has the name of the file.
+    Empty cells and columns at the end do not matter. A first column without a name holds the names
+    of the rows, which in a wide table without a column `id` are those of the specimens. Two columns
+    of numbers without a header are the points of one specimen, which has the name of the file.
 
     **Arguments:**
 
     - `path`: the file; one that gzip compressed is decompressed.
-    - `id`: the column that names specimens, in any case. Without it, wide rows have no name. A long table may lack
-      it only if no other column could be it; `None` says that it is one specimen.
-    - `point`: long layout: the column that numbers the points of a specimen, from 0 or 1 without gaps; rows
-      may come in any order. Without it they are in order.
-    - `delimiter`: by default the first of tab, semicolon, bar, comma and blanks that divides the header.
-    - `decimal`: the decimal sign; by default a comma where numbers have commas and none has a point.
-    - `missing`: codes for a missing value, such as -999, beside empty cells, `NA`, `NaN`, `null` and the like. Missing
-      values become NaN. A `UserWarning` tells of points that look like codes and are not read so.
+    - `id`: the column that names specimens, in any case. Without it, wide rows have no name. A long
+      table may lack it only if no other column could be it; `None` says that it is one specimen.
+    - `point`: long layout: the column that numbers the points of a specimen, from 0 or 1 without
+      gaps; rows may come in any order. Without it they are in order.
+    - `delimiter`: by default the first of tab, semicolon, bar, comma and blanks that divides the
+      header.
+    - `decimal`: the decimal sign; by default a comma where numbers have commas and none has a
+      point.
+    - `missing`: codes for a missing value, such as -999, beside empty cells, `NA`, `NaN`, `null`
+      and the like. Missing values become NaN. A `UserWarning` tells of points that look like codes
+      and are not read so.
     - `dim`: 2 or 3, where coordinates are numbered through.
     - `encoding`: of the text, unless the file has a byte order mark, which says it.
 
     **Returns:** a list of `Specimen`, in order of appearance.
 
-    **Raises:** `ValueError` with file, line number, what was expected and what was found, for anything else.
+    **Raises:** `ValueError` with file, line number, what was expected and what was found, for
+    anything else.
     """
     for name, value in (("id", id), ("point", point)):
         allowed = isinstance(value, str) or name == "id" and value is None
         require(allowed, f"`{name}` must be the name of a column; got {words(value)}.")
-    require(decimal in (None, ".", ","), f"`decimal` must be '.' or ',', or None; got {words(decimal)}.")
+    require(
+        decimal in (None, ".", ","), f"`decimal` must be '.' or ',', or None; got {words(decimal)}."
+    )
     if dim is not None:
         message = f"`dim` must be 2 or 3, or None; got {words(dim)}."
         require(positive_integer(dim, "dim") in (2, 3), message)
@@ -131,18 +138,18 @@ def write_csv(
 ) -> None:
     """Write the landmarks of specimens so that `read_csv` returns the same ones, to the last digit.
 
-    Columns are `id`, the notes, then the coordinates; the long layout numbers points from 1. Missing values
-    are NA.
+    Columns are `id`, the notes, then the coordinates; the long layout numbers points from 1.
+    Missing values are NA.
 
     **Arguments:**
 
     - `path`: the file; a name that ends in `.gz` is compressed.
-    - `specimens`: with the same keys of notes and the same dimension; for the wide layout with equally many
-      landmarks.
+    - `specimens`: with the same keys of notes and the same dimension; for the wide layout with
+      equally many landmarks.
     - `layout`: `"wide"` or `"long"`.
 
-    **Raises:** `ValueError` for specimens that do not fit one table, and for curves, images and scales, which
-    have no column.
+    **Raises:** `ValueError` for specimens that do not fit one table, and for curves, images and
+    scales, which have no column.
     """
     specimens = as_specimens(specimens)
     choice(layout, "layout", ("wide", "long"))
@@ -212,9 +219,17 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
                 line = reader.line_num + bool(said)
                 records.append((line, [cell.strip() for cell in cells]))
     except csv.Error as error:
-        fail(path, reader.line_num, "cells of a table", f"something else ({error})", "Close all quotes.")
+        fail(
+            path,
+            reader.line_num,
+            "cells of a table",
+            f"something else ({error})",
+            "Close all quotes.",
+        )
     if not records:
-        fail(path, 1, "a header such as id,x1,y1,x2,y2", "nothing", "Write the names of the columns.")
+        fail(
+            path, 1, "a header such as id,x1,y1,x2,y2", "nothing", "Write the names of the columns."
+        )
     bare = all(_is_number(cell) for cell in records[0][1])
     if bare:
         header = [str(j) for j in range(1, len(records[0][1]) + 1)]
@@ -236,7 +251,13 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
     for line, cells in records:
         for j, cell in enumerate(cells):
             if cell and j not in kept:
-                fail(path, line, f"nothing in column {j + 1}, which has no name", repr(cell), "Name it.")
+                fail(
+                    path,
+                    line,
+                    f"nothing in column {j + 1}, which has no name",
+                    repr(cell),
+                    "Name it.",
+                )
     header = [header[j] for j in kept]
     twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
@@ -250,7 +271,9 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
 
 def _reader(content: str, delimiter: str):
     blanks = delimiter == " "
-    return csv.reader(io.StringIO(content, newline=""), delimiter=delimiter, skipinitialspace=blanks)
+    return csv.reader(
+        io.StringIO(content, newline=""), delimiter=delimiter, skipinitialspace=blanks
+    )
 
 
 def _delimiter_of(content: str) -> str:
@@ -298,12 +321,20 @@ def _wide_columns(table: Table, dim: int | None) -> list[str]:
         return []
     if len(whole) > 1:
         found = " and ".join(repr(places[0][2]) for places in whole)
-        fail(table.path, 1, "one set of coordinates", f"those of {found}", "Delete or rename the others.")
+        fail(
+            table.path,
+            1,
+            "one set of coordinates",
+            f"those of {found}",
+            "Delete or rename the others.",
+        )
     columns = {}
     for i, axis, name in whole[0]:
         if (i, axis) in columns:
             found = f"{columns[i, axis]!r} and {name!r}"
-            fail(table.path, 1, "one column for a coordinate", found, "Rename or delete one of them.")
+            fail(
+                table.path, 1, "one column for a coordinate", found, "Rename or delete one of them."
+            )
         columns[i, axis] = name
     indices = sorted({i for i, _ in columns})
     axes = sorted({axis for _, axis in columns})
@@ -350,8 +381,9 @@ def _num_axes(table: Table, columns: list[str], dim: int | None) -> int:
         fail(table.path, 1, f"a multiple of {found} coordinates", f"{count}", cure)
     if dim is None and count % 6 == 0:
         warnings.warn(
-            f"{fspath(table.path)}: {columns[0]!r} to {columns[-1]!r} are read as {count // 2} points in "
-            f"the plane. Pass `dim=2` if they are, or `dim=3` if they are {count // 3} points in space.",
+            f"{fspath(table.path)}: {columns[0]!r} to {columns[-1]!r} are read as {count // 2} "
+            f"points in the plane. Pass `dim=2` if they are, or `dim=3` if they are {count // 3} "
+            "points in space.",
             stacklevel=3,
         )
     return found
@@ -385,7 +417,8 @@ def _bare_columns(table: Table) -> list[str]:
 
 
 def _decimal_sign(table: Table, columns: list[str], codes: Collection[str | float]) -> str:
-    """A comma where numbers have commas, none has a point, and the commas do not separate thousands."""
+    """A comma where numbers have commas, none has a point, and the commas do not separate
+    thousands."""
     every = [row.cells[name] for row in table.rows for name in columns]
     cells = [cell for cell in every if cell.lower() not in codes]
     with_comma = [cell for cell in cells if "," in cell]
@@ -428,7 +461,13 @@ def _long(
 ) -> list[Specimen]:
     column, order = _id_column(table, id), table.column(point)
     if order is None and point != "point":
-        fail(table.path, 1, f"a column {point!r}", table.listed(), "Pass the `point` column of the file.")
+        fail(
+            table.path,
+            1,
+            f"a column {point!r}",
+            table.listed(),
+            "Pass the `point` column of the file.",
+        )
     others = [name for name in table.header if name and name not in (*columns, column, order)]
     if column is None and id is not None:
         _check_one_specimen(table, others)
@@ -461,20 +500,26 @@ def _check_one_specimen(table: Table, others: list[str]) -> None:
     They hold every value twice or more.
     """
     repeated = [
-        name
-        for name in others
-        if min(Counter(row.cells[name] for row in table.rows).values()) > 1
+        name for name in others if min(Counter(row.cells[name] for row in table.rows).values()) > 1
     ]
     if repeated:
         listed = ", ".join(map(repr, repeated))
         cure = (
-            f"Pass `id={repeated[0]!r}` if that names the specimens, or `id=None` if all rows are points of one."
+            f"Pass `id={repeated[0]!r}` if that names the specimens, or `id=None` if all rows are "
+            "points of one."
         )
-        fail(table.path, 1, "a column 'id' that names the specimens", f"no column id, but {listed}", cure)
+        fail(
+            table.path,
+            1,
+            "a column 'id' that names the specimens",
+            f"no column id, but {listed}",
+            cure,
+        )
 
 
 def _check_order(table: Table, groups: dict[str | None, list[Row]], others: list[str]) -> None:
-    """Refuses rows without numbers in which a further column says that points come in different orders.
+    """Refuses rows without numbers in which a further column says that points come in different
+    orders.
 
     Its values are different ones within a specimen, and more or less the same in all.
     """
@@ -489,15 +534,21 @@ def _check_order(table: Table, groups: dict[str | None, list[Row]], others: list
         for id, values in rest:
             if values != first[1]:
                 cure = (
-                    f"Pass `point={name!r}` if that numbers the points, or sort the rows and add NA for missing points."
+                    f"Pass `point={name!r}` if that numbers the points, or sort the rows and add "
+                    "NA for missing points."
                 )
-                found = f"{', '.join(values[:6])} for {id!r} and {', '.join(first[1][:6])} for {first[0]!r}"
-                fail(table.path, groups[id][0].line, f"one order of points in {name!r}", found, cure)
+                one, other = ", ".join(first[1][:6]), ", ".join(values[:6])
+                found = f"{one} for {first[0]!r} and {other} for {id!r}"
+                fail(
+                    table.path, groups[id][0].line, f"one order of points in {name!r}", found, cure
+                )
 
 
 def _in_order(table: Table, group: list[Row], point: str) -> list[Row]:
     """Rows of one specimen by the number of their point."""
-    cure = "Number the points of a specimen from 0 or 1, each once; give a missing one a row with NA."
+    cure = (
+        "Number the points of a specimen from 0 or 1, each once; give a missing one a row with NA."
+    )
     numbered = []
     for row in group:
         cell = row.cells[point]
@@ -522,19 +573,24 @@ def _check_table(specimens: list[Specimen], layout: str) -> None:
     for i, specimen in enumerate(specimens):
         if specimen.curves or specimen.image is not None or specimen.scale is not None:
             raise ValueError(
-                f"`specimens[{i}]` has curves, an image or a scale, which no column holds: use `write_tps`."
+                f"`specimens[{i}]` has curves, an image or a scale, which no column holds: use "
+                "`write_tps`."
             )
-        if specimen.landmarks.shape[columns] != first.landmarks.shape[columns] or not len(specimen.landmarks):
+        if specimen.landmarks.shape[columns] != first.landmarks.shape[columns] or not len(
+            specimen.landmarks
+        ):
             raise ValueError(
                 f"`specimens[{i}]` has landmarks of shape {specimen.landmarks.shape}, the first of "
-                f"{first.landmarks.shape}: a table holds shapes of one dimension with at least one point, "
-                "a wide one also of one number of points."
+                f"{first.landmarks.shape}: a table holds shapes of one dimension with at least one "
+                "point, a wide one also of one number of points."
             )
         if list(specimen.notes) != list(first.notes):
             raise ValueError(
-                f"`specimens[{i}]` has the notes {list(specimen.notes)}, the first {list(first.notes)}: "
-                "give all the same keys in the same order."
+                f"`specimens[{i}]` has the notes {list(specimen.notes)}, the first "
+                f"{list(first.notes)}: give all the same keys in the same order."
             )
     ids = [specimen.id for specimen in specimens]
     if layout == "long" and len(set(ids)) < len(ids):
-        raise ValueError("`specimens` need different ids in a long table, where they keep the rows together.")
+        raise ValueError(
+            "`specimens` need different ids in a long table, where they keep the rows together."
+        )

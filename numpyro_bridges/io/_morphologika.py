@@ -1,4 +1,5 @@
-"""The format of Morphologika (P. O'Higgins and N. Jones): sections that begin with a name in brackets.
+"""The format of Morphologika (P. O'Higgins and N. Jones): sections that begin with a name in
+brackets.
 
 ```text
 [individuals]
@@ -43,7 +44,8 @@ def read_morphologika(
     missing: str | float | Iterable[str | float] = (),
     encoding: str = "utf-8",
 ) -> list[Specimen]:
-    """Specimens of a Morphologika file, with their names, and their labels and groups as `Specimen.notes`.
+    """Specimens of a Morphologika file, with their names, and their labels and groups as
+    `Specimen.notes`.
 
     Sections that say how to draw shapes (wireframe, polygons) are skipped.
 
@@ -55,7 +57,8 @@ def read_morphologika(
 
     **Returns:** a list of `Specimen`.
 
-    **Raises:** `ValueError` with file, line number, what was expected and what was found, for anything else.
+    **Raises:** `ValueError` with file, line number, what was expected and what was found, for
+    anything else.
     """
     codes = missing_codes(missing)
     sections = _sections(path, read_lines(path, encoding))
@@ -133,13 +136,13 @@ def _notes(path: str | PathLike, sections: dict[str, _Lines], count: int) -> lis
                 cure = "Write each without blanks."
                 fail(path, line, f"{len(labels)} values of labels", repr(value), cure)
             note |= dict(zip(labels, parts, strict=True))
-    groups = [(i, word) for i, line in sections.get("groups", []) for word in line.split()]
-    sizes = [(word, int(n)) for (_, word), (_, n) in zip(groups[::2], groups[1::2]) if n.isdecimal()]
-    if groups and sum(size for _, size in sizes) != count:
-        found = " ".join(word for _, word in groups)
+    words = [word for _, line in sections.get("groups", []) for word in line.split()]
+    sizes = [int(word) if word.isdecimal() else 0 for word in words[1::2]]
+    if words and (len(words) % 2 or sum(sizes) != count):
         cure = "It says the name and the size of each group."
-        fail(path, groups[0][0], f"[groups] of {count} specimens in all", repr(found), cure)
-    of_each = [word for word, size in sizes for _ in range(size)]
-    for note, group in zip(notes, of_each):
-        note["group"] = group
+        line = sections["groups"][0][0]
+        fail(path, line, f"[groups] of {count} specimens in all", repr(" ".join(words)), cure)
+    in_groups = [name for name, size in zip(words[::2], sizes, strict=True) for _ in range(size)]
+    for i, name in enumerate(in_groups):
+        notes[i]["group"] = name
     return notes

@@ -27,9 +27,9 @@ _HEADER = re.compile(
 def read_nts(path: str | PathLike, *, encoding: str = "utf-8") -> list[Specimen]:
     """Specimens of an NTS file, one a row; or the one specimen of a file whose rows are points.
 
-    Rows are points where there are as many columns as dimensions; the specimen then has the name of the file. The
-    labels of rows are the names of specimens, or those of points, in `Specimen.notes["labels"]`, one a line. Missing
-    are the code that the file names, and NA.
+    Rows are points where there are as many columns as dimensions; the specimen then has the name of
+    the file. The labels of rows are the names of specimens, or those of points, in
+    `Specimen.notes["labels"]`, one a line. Missing are the code that the file names, and NA.
 
     **Arguments:**
 
@@ -38,7 +38,8 @@ def read_nts(path: str | PathLike, *, encoding: str = "utf-8") -> list[Specimen]
 
     **Returns:** a list of `Specimen`.
 
-    **Raises:** `ValueError` with file, line number, what was expected and what was found, for anything else.
+    **Raises:** `ValueError` with file, line number, what was expected and what was found, for
+    anything else.
     """
     lines = read_lines(path, encoding)
     content = [(i, line) for i, line in enumerate(lines, start=1) if line and line[0] not in "\"'"]
@@ -96,4 +97,10 @@ class _Tokens:
 
     def end(self) -> None:
         for line, word in self._rest:
-            fail(self.path, line, "the end of the file", repr(word), "The first line says too little.")
+            fail(
+                self.path,
+                line,
+                "the end of the file",
+                repr(word),
+                "The first line says too little.",
+            )

@@ -24,8 +24,8 @@ _READERS = {
 def read(path: str | PathLike, *, encoding: str = "utf-8", **settings) -> list[Specimen]:
     """Specimens of a file in any of the formats of this module, which is told by what stands in it.
 
-    **Arguments:** `settings`: those of the format's own reader, `read_tps`, `read_csv`, `read_slicer`, `read_nts` or
-    `read_morphologika`. What is none of the others is read as a table.
+    **Arguments:** `settings`: those of the format's own reader, `read_tps`, `read_csv`,
+    `read_slicer`, `read_nts` or `read_morphologika`. What is none of the others is read as a table.
 
     **Returns:** a list of `Specimen`.
     """

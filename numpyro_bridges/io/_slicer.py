@@ -12,22 +12,23 @@ from ._specimen import Specimen, fail, number, read_text, stem
 _CURVES = ("Curve", "ClosedCurve", "Line")
 _DEFINED = ("defined", "2")
 _STATES = ("undefined", "preview", "missing", "0", "1", "3", *_DEFINED)
-_COLUMNS = (
-    "id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label", "desc", "associatednodeid",
-    "positionstatus", "autocreated",
-)  # fmt: skip
+_COLUMNS: tuple[str, ...] = (
+    *("id", "x", "y", "z", "ow", "ox", "oy", "oz", "vis", "sel", "lock", "label", "desc"),
+    *("associatednodeid", "positionstatus", "autocreated"),
+)
 """Of `.fcsv`; the last two are there without being named."""
 _SYSTEMS = {"0": "RAS", "1": "LPS"}
 """What older files call the coordinate systems."""
 
 
 def read_slicer(path: str | PathLike, *, encoding: str = "utf-8") -> list[Specimen]:
-    """The specimen of a file of markups of 3D Slicer, `.mrk.json` or `.fcsv`, which has the name of the file.
+    """The specimen of a file of markups of 3D Slicer, `.mrk.json` or `.fcsv`.
 
-    Control points of a list of points are landmarks, those of curves and lines are curves. A point that is not
-    defined is missing (NaN). Coordinates are those of the file. Its coordinate system is in
-    `Specimen.notes["coordinate system"]`: LPS and RAS differ by half a turn, which alignment takes out. The labels of
-    the landmarks are in `notes["labels"]`, one a line.
+    It has the name of the file. Control points of a list of points are landmarks, those of curves
+    and lines are curves. A point that is not defined is missing (NaN). Coordinates are those of the
+    file. Its coordinate system is in `Specimen.notes["coordinate system"]`: LPS and RAS differ by
+    half a turn, which alignment takes out. The labels of the landmarks are in `notes["labels"]`,
+    one a line.
 
     **Arguments:**
 
@@ -112,14 +113,18 @@ def _from_fcsv(path: str | PathLike, content: str) -> Specimen:
         if "z" not in cells:
             fail(path, i, "a point with x, y, z", repr(line), "Save the markups again.")
         defined = _is_defined(path, i, cells.get("positionstatus", "").strip() or "defined")
-        position = [number(cells[axis].strip(), path, i) for axis in "xyz"] if defined else [np.nan] * 3
+        position = (
+            [number(cells[axis].strip(), path, i) for axis in "xyz"] if defined else [np.nan] * 3
+        )
         landmarks.append(position)
         labels.append(cells.get("label", ""))
     if not landmarks:
-        fail(path, len(lines), "at least one point", "the end of the file", "Save the markups again.")
-    system = said.get("coordinatesystem", "0")
+        fail(
+            path, len(lines), "at least one point", "the end of the file", "Save the markups again."
+        )
+    system = str(said.get("coordinatesystem", "0"))
     return Specimen(
-        np.array(landmarks), id=stem(path), notes=_notes(_SYSTEMS.get(system, system), labels)
+        np.array(landmarks), id=stem(path), notes=_notes(str(_SYSTEMS.get(system, system)), labels)
     )
 
 

@@ -38,8 +38,8 @@ _CODES = (999.0, 9999.0, 99999.0)
 class Specimen:
     """Landmarks and curves of one specimen, with what its file says about it.
 
-    - `landmarks`: (n, d), d = 2 or 3, in the file's unit; NaN where missing; n = 0 where there are only
-      curves.
+    - `landmarks`: (n, d), d = 2 or 3, in the file's unit; NaN where missing; n = 0 where there are
+      only curves.
     - `curves`: arrays (n_j, d), one for each curve or outline.
     - `id`, `image`: as written in the file, or `None`.
     - `scale`: length units per file unit, or `None`. Coordinates are *not* multiplied by it.
@@ -62,13 +62,19 @@ class Specimen:
         object.__setattr__(self, "curves", curves)
         object.__setattr__(self, "landmarks", known_float(self.landmarks, "landmarks"))
         if self.scale is not None:
-            scale = known_number(self.scale, "scale", "a positive number, or None", lambda value: value > 0)
+            scale = known_number(
+                self.scale, "scale", "a positive number, or None", lambda value: value > 0
+            )
             object.__setattr__(self, "scale", scale)
         for name in ("id", "image"):
             value = getattr(self, name)
-            require(value is None or isinstance(value, str), f"`{name}` must be text, or None; got {words(value)}.")
+            require(
+                value is None or isinstance(value, str),
+                f"`{name}` must be text, or None; got {words(value)}.",
+            )
         require(
-            isinstance(self.notes, Mapping) and all(isinstance(x, str) for item in self.notes.items() for x in item),
+            isinstance(self.notes, Mapping)
+            and all(isinstance(x, str) for item in self.notes.items() for x in item),
             f"`notes` must be text by key, texts both; got {words(self.notes)}.",
         )
         shape = self.landmarks.shape
@@ -76,11 +82,14 @@ class Specimen:
             raise ValueError(f"`landmarks` must have the shape (n, 2) or (n, 3), got {shape}.")
         for j, curve in enumerate(self.curves):
             if curve.ndim != 2 or curve.shape[1] != shape[1]:
-                raise ValueError(f"`curves[{j}]` must have the shape (n, {shape[1]}), got {curve.shape}.")
+                raise ValueError(
+                    f"`curves[{j}]` must have the shape (n, {shape[1]}), got {curve.shape}."
+                )
 
 
 def open_text(path: str | PathLike, encoding: str) -> TextIO:
-    """A text file to write, compressed where its name ends in `.gz`; line ends are written as they are."""
+    """A text file to write, compressed where its name ends in `.gz`; line ends are written as they
+    are."""
     path = as_path(path, "path")
     check_encoding(encoding)
     if fspath(path).endswith(".gz"):
@@ -149,7 +158,8 @@ def read_lines(path: str | PathLike, encoding: str) -> list[str]:
 
 
 def stem(path: str | PathLike) -> str:
-    """The name of a file without its endings: what a specimen is called that has a file to itself."""
+    """The name of a file without its endings: what a specimen is called that has a file to
+    itself."""
     return re.sub(r"(?i)(\.mrk)?\.\w+(\.gz)?$", "", Path(path).name)
 
 
@@ -192,7 +202,8 @@ def number(
 
 
 def missing_codes(missing: str | float | Iterable[str | float]) -> frozenset[str | float]:
-    """Codes that a user names, and the usual texts: as texts, and those that are numbers as numbers."""
+    """Codes that a user names, and the usual texts: as texts, and those that are numbers as
+    numbers."""
     listed = isinstance(missing, Iterable) and not isinstance(missing, (str, bytes))
     codes: set[str | float] = set(NOT_AVAILABLE)
     for code in list(missing) if listed else [missing]:  # type: ignore[arg-type]
@@ -203,14 +214,17 @@ def missing_codes(missing: str | float | Iterable[str | float]) -> frozenset[str
             except ValueError:
                 pass  # a code that is no number, such as "x"
         else:
-            codes.add(known_number(code, "missing", "a code, a text or a number, or a list of them"))
+            codes.add(
+                known_number(code, "missing", "a code, a text or a number, or a list of them")
+            )
     return frozenset(codes)
 
 
 def warn_of_codes(path: str | PathLike, specimens: list[Specimen], cure: str) -> None:
     """Tells of points that look as if they stood for missing ones, and are read as they are.
 
-    That is: all coordinates the same negative number where all others are positive, or all 999 or the like.
+    That is: all coordinates the same negative number where all others are positive, or all 999 or
+    the like.
     """
     suspects = []
     for i, specimen in enumerate(specimens):
@@ -226,8 +240,8 @@ def warn_of_codes(path: str | PathLike, specimens: list[Specimen], cure: str) ->
         name, point, value = suspects[0]
         more = f", and {len(suspects) - 1} more" if len(suspects) > 1 else ""
         warnings.warn(
-            f"{fspath(path)}: point {point} of {name} is {value:g} in all its coordinates{more}: a code "
-            f"for a missing point? They are read as they are. {cure}",
+            f"{fspath(path)}: point {point} of {name} is {value:g} in all its coordinates{more}: a "
+            f"code for a missing point? They are read as they are. {cure}",
             stacklevel=3,
         )
 

@@ -42,27 +42,31 @@ _LINES = ("CURVES", "OUTLINES")
 _RESERVED = {*_BLOCKS, *_FIELDS, *_LINES, "POINTS"}
 
 
-def read_tps(path: str | PathLike, *, negative_is_missing: bool = False, encoding: str = "utf-8") -> list[Specimen]:
+def read_tps(
+    path: str | PathLike, *, negative_is_missing: bool = False, encoding: str = "utf-8"
+) -> list[Specimen]:
     """Specimens of a tps file, in its order.
 
-    Keys may be in any case; blank lines and blanks at the end of a line do not matter, nor do lines of
-    comment before the first LM=. OUTLINES are curves, after those of CURVES. Keys other than LM, LM3, CURVES,
-    OUTLINES, POINTS, IMAGE, ID and SCALE (COMMENT, VARIABLES, ...) are kept in `Specimen.notes`, one that
-    comes twice with its texts on two lines; those that carry rows of numbers (RADII) are refused. SCALE is
-    reported, not applied; one that is empty or NA is none.
+    Keys may be in any case; blank lines and blanks at the end of a line do not matter, nor do lines
+    of comment before the first LM=. OUTLINES are curves, after those of CURVES. Keys other than LM,
+    LM3, CURVES, OUTLINES, POINTS, IMAGE, ID and SCALE (COMMENT, VARIABLES, ...) are kept in
+    `Specimen.notes`, one that comes twice with its texts on two lines; those that carry rows of
+    numbers (RADII) are refused. SCALE is reported, not applied; one that is empty or NA is none.
 
     **Arguments:**
 
     - `path`: the file; a name that ends in `.gz` is decompressed.
-    - `negative_is_missing`: tokens `NA` and `NaN` always are missing values and become NaN. tpsDig instead
-      marks a missing landmark with negative coordinates. As aligned data are negative too, that is only read
-      so if asked for: then a landmark with a negative coordinate becomes NaN in all its coordinates. Curves
-      are left alone. A `UserWarning` tells of landmarks that look like such marks and are not read so.
+    - `negative_is_missing`: tokens `NA` and `NaN` always are missing values and become NaN. tpsDig
+      instead marks a missing landmark with negative coordinates. As aligned data are negative too,
+      that is only read so if asked for: then a landmark with a negative coordinate becomes NaN in
+      all its coordinates. Curves are left alone. A `UserWarning` tells of landmarks that look like
+      such marks and are not read so.
     - `encoding`: of the text.
 
     **Returns:** a list of `Specimen`.
 
-    **Raises:** `ValueError` with file, line number, what was expected and what was found, for anything else.
+    **Raises:** `ValueError` with file, line number, what was expected and what was found, for
+    anything else.
     """
     negative_is_missing = flag(negative_is_missing, "negative_is_missing")
     lines = _Lines(path, read_lines(path, encoding))
@@ -75,13 +79,15 @@ def read_tps(path: str | PathLike, *, negative_is_missing: bool = False, encodin
     return specimens
 
 
-def write_tps(path: str | PathLike, specimens: Iterable[Specimen], *, encoding: str = "utf-8") -> None:
+def write_tps(
+    path: str | PathLike, specimens: Iterable[Specimen], *, encoding: str = "utf-8"
+) -> None:
     """Write specimens so that `read_tps` returns the same ones, to the last digit.
 
     Missing values are written as NA. A name that ends in `.gz` is compressed.
 
-    **Raises:** `ValueError` where a text would not read back: line breaks (except in notes), blanks at its
-    ends, a note whose key has a meaning in the format.
+    **Raises:** `ValueError` where a text would not read back: line breaks (except in notes), blanks
+    at its ends, a note whose key has a meaning in the format.
     """
     lines = [line for specimen in as_specimens(specimens) for line in _format(specimen)]
     with open_text(path, encoding) as file:
@@ -89,7 +95,8 @@ def write_tps(path: str | PathLike, specimens: Iterable[Specimen], *, encoding: 
 
 
 class _Lines:
-    """The lines with content: `current` is the next one, `None` at the end, and `number` its number."""
+    """The lines with content: `current` is the next one, `None` at the end, and `number` its
+    number."""
 
     def __init__(self, path: str | PathLike, every: list[str]):
         self.path = path
@@ -131,8 +138,8 @@ def _specimen(lines: _Lines, negative_is_missing: bool) -> Specimen:
     key, _ = lines.key() or ("", "")
     if key not in _BLOCKS:
         cure = (
-            "A specimen begins with LM=: delete what stands before the first one; numbers follow LM=, LM3= or "
-            "POINTS= only, as many as these say."
+            "A specimen begins with LM=: delete what stands before the first one; numbers follow "
+            "LM=, LM3= or POINTS= only, as many as these say."
         )
         lines.fail("LM= or LM3=", cure)
     dim, began = _BLOCKS[key], lines.number
@@ -146,12 +153,16 @@ def _specimen(lines: _Lines, negative_is_missing: bool) -> Specimen:
     while (entry := lines.key()) is not None and entry[0] not in _BLOCKS:
         key, value = entry
         if key in fields or key in curves:
-            lines.fail(f"{key}= once for the specimen from line {began}", "Delete one of the two lines.")
+            lines.fail(
+                f"{key}= once for the specimen from line {began}", "Delete one of the two lines."
+            )
         if key in _LINES:
             curves[key] = list(_curves(lines, key, dim))
             continue
         if key == "POINTS":
-            lines.fail("CURVES= before POINTS=", "CURVES= gives the number of POINTS= blocks: correct it.")
+            lines.fail(
+                "CURVES= before POINTS=", "CURVES= gives the number of POINTS= blocks: correct it."
+            )
         if key == "SCALE":
             fields[key] = _scale(lines, value)
         elif key in _FIELDS:
@@ -177,7 +188,9 @@ def _scale(lines: _Lines, value: str) -> float | None:
 def _count(lines: _Lines) -> int:
     key, value = lines.key() or ("", "")
     if not value.isdecimal():
-        lines.fail(f"a whole number after {key}=", "Write the number of rows or blocks that follow.")
+        lines.fail(
+            f"a whole number after {key}=", "Write the number of rows or blocks that follow."
+        )
     lines.advance()
     return int(value)
 
@@ -222,9 +235,14 @@ def _format(specimen: Specimen) -> Iterator[str]:
     if specimen.scale is not None:
         yield f"SCALE={float(specimen.scale)!r}"
     for key, value in specimen.notes.items():
-        if not re.fullmatch(r"[^\s=]([^\n\r=]*[^\s=])?", key) or key != key.upper() or key in _RESERVED:
+        if (
+            not re.fullmatch(r"[^\s=]([^\n\r=]*[^\s=])?", key)
+            or key != key.upper()
+            or key in _RESERVED
+        ):
             raise ValueError(
-                f"`notes` has the key {key!r}: use upper case, and no key that has a meaning in the format."
+                f"`notes` has the key {key!r}: use upper case, and no key that has a meaning in "
+                "the format."
             )
         for line in value.split("\n"):
             yield f"{key}={_one_line(line, 'notes')}"
