@@ -1,4 +1,4 @@
-"""Reading and writing of files of shapes, sets of specimens, and what is said about broken files."""
+"""Reading and writing of files of shapes, sets of specimens, and what is said of broken files."""
 
 import gzip
 import json
@@ -374,24 +374,30 @@ class TestReadCsv:
 TRIANGLE = [[1.0, 2.0], [3.5, -4.0], [5.0, 6.25]]
 SQUARE = [[0.5, 0.0], [10.0, 11.0], [-2.5, 7.0]]
 
+ROWS = "\na,1,2,3.5,-4,5,6.25\nb,.5,0,10,11,-2.5,7\n"
+EUROPEAN = ROWS.replace(",", ";").replace(".", ",")
+
 WIDE = {
-    "upper": "id,X1,Y1,X2,Y2,X3,Y3\na,1,2,3.5,-4,5,6.25\nb,.5,0,10,11,-2.5,7\n",
+    "upper": "id,X1,Y1,X2,Y2,X3,Y3" + ROWS,
     "zeros": "ID,x01,x02,x03,y01,y02,y03\na,1,3.5,5,2,-4,6.25\nb,.5,10,-2.5,0,11,7\n",
-    "number-first": "Id,1_x,1_y,2_x,2_y,3_x,3_y\na,1,2,3.5,-4,5,6.25\nb,.5,0,10,11,-2.5,7\n",
-    "geomorph": '"","1.X","1.Y","2.X","2.Y","3.X","3.Y"\n"a",1,2,3.5,-4,5,6.25\n"b",.5,0,10,11,-2.5,7\n',
-    "r-blanks": '"X1.X" "X1.Y" "X2.X" "X2.Y" "X3.X" "X3.Y"\n"a" 1 2 3.5 -4 5 6.25\n"b" .5 0 10 11 -2.5 7\n',
-    "prefix": "id\tLM1x\tLM1y\tLM2x\tLM2y\tLM3x\tLM3y\na\t1\t2\t3.5\t-4\t5\t6.25\nb\t.5\t0\t10\t11\t-2.5\t7\n",
-    "names": "id,tip_x,tip_y,hinge_x,hinge_y,end_x,end_y\na,1,2,3.5,-4,5,6.25\nb,.5,0,10,11,-2.5,7\n",
-    "units": "id|X 1 (mm)|Y 1 (mm)|X 2 (mm)|Y 2 (mm)|X 3 (mm)|Y 3 (mm)\na|1|2|3.5|-4|5|6.25\nb|.5|0|10|11|-2.5|7\n",
-    "decimal-comma": "id;x1;y1;x2;y2;x3;y3\na;1;2;3,5;-4;5,0;6,25\nb;0,5;0;10;11;-2,5;7\n",
+    "number-first": "Id,1_x,1_y,2_x,2_y,3_x,3_y" + ROWS,
+    "geomorph": '"","1.X","1.Y","2.X","2.Y","3.X","3.Y"' + ROWS,
+    "r-blanks": ('"X1.X","X1.Y","X2.X","X2.Y","X3.X","X3.Y"' + ROWS).replace(",", " "),
+    "prefix": ("id,LM1x,LM1y,LM2x,LM2y,LM3x,LM3y" + ROWS).replace(",", "\t"),
+    "names": "id,tip_x,tip_y,hinge_x,hinge_y,end_x,end_y" + ROWS,
+    "units": ("id,X 1 (mm),Y 1 (mm),X 2 (mm),Y 2 (mm),X 3 (mm),Y 3 (mm)" + ROWS).replace(",", "|"),
+    "decimal-comma": "id;x1;y1;x2;y2;x3;y3" + EUROPEAN,
     "quoted-comma": 'id,x1,y1,x2,y2,x3,y3\na,1,2,"3,5",-4,5,"6,25"\nb,"0,5",0,10,11,"-2,5",7\n',
-    "spreadsheet": "sep=;\nid;x1;y1;x2;y2;x3;y3;;\na;1;2;3,5;-4;5,0;6,25;;\nb;0,5;0;10;11;-2,5;7;;\n;;;;;;;;\n",
-    "row-numbers": ",id,x1,y1,x2,y2,x3,y3\n0,a,1,2,3.5,-4,5,6.25\n1,b,.5,0,10,11,-2.5,7,,\n",
+    "spreadsheet": "sep=;\nid;x1;y1;x2;y2;x3;y3;;" + EUROPEAN.replace("\n", ";;\n") + ";;;;;;;;\n",
+    "row-numbers": ",id,x1,y1,x2,y2,x3,y3" + ROWS.replace("a,", "0,a,").replace("b,", "1,b,"),
 }
 LONG = {
     "upper": "ID,X,Y\na,1,2\na,3.5,-4\na,5,6.25\nb,.5,0\nb,10,11\nb,-2.5,7\n",
     "comma": "id;x;y\na;1;2\na;3,5;-4\na;5;6,25\nb;0,5;0\nb;10;11\nb;-2,5;7\n",
-    "numbered": "id\tPoint\tX (px)\tY (px)\na\t3\t5\t6.25\nb\t1\t.5\t0\na\t1\t1\t2\na\t2\t3.5\t-4\nb\t3\t-2.5\t7\nb\t2\t10\t11\n",
+    "numbered": (
+        "id\tPoint\tX (px)\tY (px)\na\t3\t5\t6.25\nb\t1\t.5\t0\na\t1\t1\t2\na\t2\t3.5\t-4\n"
+        "b\t3\t-2.5\t7\nb\t2\t10\t11\n"
+    ),
     "labels": "id,lm,x,y\na,p,1,2\na,q,3.5,-4\na,r,5,6.25\nb,p,.5,0\nb,q,10,11\nb,r,-2.5,7\n",
 }
 
@@ -543,7 +549,7 @@ class TestSlicer:
                 r"found markups of the type \['Plane'\]",
             ),
             (
-                '{"markups": [{"type": "Fiducial", "controlPoints": []}, {"type": "Fiducial", "controlPoints": []}]}',
+                json.dumps({"markups": [{"type": "Fiducial", "controlPoints": []}] * 2}),
                 1,
                 "one list of points, found 2",
             ),
@@ -698,7 +704,7 @@ class TestMorphologika:
         ("1 2 2 0\n1 2\n3 4\n", "a.nts", {}),
         ('"of a microscope\n1 1L 4 0 dim=2\na\n1 2 3 4\n', "b.txt", {}),
         (
-            "[individuals]\n1\n[landmarks]\n2\n[dimensions]\n2\n[names]\na\n[rawpoints]\n1 2\n3 4\n",
+            "[individuals]\n1\n[landmarks]\n2\n[dimensions]\n2\n[names]\na\n[rawpoints]\n1 2\n3 4",
             "b.txt",
             {},
         ),

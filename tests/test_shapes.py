@@ -189,7 +189,7 @@ class TestProcrustes:
             shapes.procrustes_align(holed)
         holed = copies.copy()
         holed[:, 0] = np.nan
-        with pytest.raises(ValueError, match=r"each point in one shape.*; \[0\] are missing in all"):
+        with pytest.raises(ValueError, match=r"each point in one shape.*; \[0\] are missing"):
             shapes.procrustes_align(holed)
         assert shapes.procrustes_align(holed, copies[0]).converged
         with pytest.raises(ValueError, match="infinite"):
@@ -237,12 +237,11 @@ class TestMirrorImages:
         np.testing.assert_allclose(found.shapes[0], shapes.unit_size(copies[0]), atol=1e-12)
 
     def test_no_false_alarms(self, rng):
-        """Of shapes that are their own mirror images, nearly so, flat in space, or nothing but noise."""
-        half = rng.normal(size=(1, 6, 2))
-        same = np.concatenate([half * [1.0, 0.0], half * [1.0, 0.0] + [0.3, 0.0]], axis=1)
-        line = same + 1e-3 * rng.normal(size=(20, 12, 2))
-        flat = np.concatenate([rng.normal(size=(1, 9, 2)) + 0.1 * rng.normal(size=(20, 9, 2)), np.zeros((20, 9, 1))], 2)
-        for some in (line, flat, flat + 1e-3 * rng.normal(size=flat.shape), rng.normal(size=(20, 12, 2))):
+        """Of shapes that are nearly their own mirror images, flat in space, or nothing but noise."""
+        noise = rng.normal(size=(20, 12, 3))
+        line = rng.normal(size=(1, 12, 2)) * [1.0, 0.0] + 1e-3 * noise[..., :2]
+        flat = (rng.normal(size=(1, 12, 3)) + 0.1 * noise) * [1.0, 1.0, 0.0]
+        for some in (line, flat, flat + 1e-3 * noise, noise, noise[..., :2]):
             assert not shapes.procrustes_align(some, max_iterations=1000).mirrored.any()
 
     def test_a_long_list_is_cut_short(self, rng):
@@ -258,9 +257,11 @@ class TestDistances:
         copies[2, 3] = np.nan
         for scale in (True, False):
             found = shapes.procrustes_align(copies, scale=scale)
-            rows = [shape[np.isfinite(shape).all(1)] - found.mean[np.isfinite(shape).all(1)] for shape in found.shapes]
-            expected = [np.sqrt(np.mean(np.sum(row**2, 1))) / shapes.rms_radius(found.mean) for row in rows]
-            np.testing.assert_allclose(found.distances, expected)
+            rms = [
+                np.sqrt(np.mean([np.sum((p - q) ** 2) for p, q in pairs if np.isfinite(p).all()]))
+                for pairs in (zip(shape, found.mean, strict=True) for shape in found.shapes)
+            ]
+            np.testing.assert_allclose(found.distances, rms / shapes.rms_radius(found.mean))
 
     def test_outliers(self, rng):
         _, copies = scatter(rng, num_shapes=40, noise=0.02)
@@ -299,12 +300,12 @@ class TestNoCompleteShape:
         _, copies = scatter(rng, num_shapes=2, num_points=6)
         copies[0, :3] = np.nan
         copies[1, 3:] = np.nan
-        with pytest.raises(ValueError, match="no two have enough points in common .* Give a `reference`"):
+        with pytest.raises(ValueError, match="no two have enough points in common .*`reference`"):
             shapes.procrustes_align(copies)
 
     def test_names_the_specimen(self):
         few = io.Specimen([[1.0, 2.0], [np.nan, 3.0], [np.nan, 1.0]], id="crushed")
-        with pytest.raises(ValueError, match=r"`shapes\[1\]` \('crushed'\) must have at least 2 seen points, got 1"):
+        with pytest.raises(ValueError, match=r"`shapes\[1\]` \('crushed'\) must have at least 2 seen"):
             shapes.procrustes_align([io.Specimen(np.eye(3)[:, :2], id="whole"), few])
         with pytest.raises(ValueError, match=r"`specimens\[1\]` \('crushed'\) has 3 landmarks"):
             shapes.procrustes_align([io.Specimen(np.eye(2), id="whole"), few])
@@ -348,7 +349,7 @@ def test_rats_turn_back_from_their_registration(shared_data):
 
 
 def test_real_shapes_raise_no_alarm(shared_data):
-    """Three dimensions, large differences between species, 911 wings; one of them mirrored is found."""
+    """Three dimensions, large differences between species, 911 wings; one that is mirrored is found."""
     with np.load(shared_data / "steinmanella" / "steinmanella.npz") as data:
         shells = data["shapes"]
     with np.load(shared_data / "ptychomya" / "outlines.npz") as data:
