@@ -130,6 +130,8 @@ class TestReadTps:
         assert one.scale is None and one.id == "a"
 
     def test_lines_before_the_first_specimen(self, file):
+        again = "LM=1\n1 2\n# the tip\nID=a\n# the next\nLM=0\n#TAG=b\n"
+        assert [one.notes for one in read_tps(file(again))] == [{}, {"#TAG": "b"}]
         comment = "# made by hand\n\nMetadata separator: __\nunit = mm\n"
         (one,) = read_tps(file(comment + "lm=1\n1 2\nID=a\n"))
         assert one.landmarks.tolist() == [[1, 2]] and one.id == "a"
@@ -314,6 +316,7 @@ class TestReadCsv:
             ("1 2 3\n4 5 6\n", 1, "a header with .*, found no header, numbers only"),
             ("id,x1,X01,y1\na,1,1,1\n", 1, "one column for a coordinate, found 'x1' and 'X01'"),
             ("id,x,X,y\na,1,1,1\n", 1, "one column x, found 'x' and 'X'"),
+            ("x,y,x.1,y.1\n1,1,1,1\n", 1, "one set of coordinates, found those of 'x' and 'x.1'"),
             (
                 "LM1_x,LM1_y,SL1_x,SL1_y\n1,1,1,1\n",
                 1,
@@ -389,6 +392,7 @@ WIDE = {
     "decimal-comma": "id;x1;y1;x2;y2;x3;y3" + EUROPEAN,
     "quoted-comma": 'id,x1,y1,x2,y2,x3,y3\na,1,2,"3,5",-4,5,"6,25"\nb,"0,5",0,10,11,"-2,5",7\n',
     "spreadsheet": "sep=;\nid;x1;y1;x2;y2;x3;y3;;" + EUROPEAN.replace("\n", ";;\n") + ";;;;;;;;\n",
+    "comments": "# of a camera\n# in mm\nid,x1,y1,x2,y2,x3,y3" + ROWS,
     "row-numbers": ",id,x1,y1,x2,y2,x3,y3" + ROWS.replace("a,", "0,a,").replace("b,", "1,b,"),
 }
 LONG = {
@@ -442,6 +446,19 @@ class TestHeaders:
         ):
             (one,) = read_csv(file(content, "wing 3.txt"))
             assert (one.id, one.landmarks.tolist()) == ("wing 3", [[1804, 1268], [1845, 1268]])
+
+    def test_header_in_a_comment(self, file, tmp_path):
+        for delimiter in (" ", ",", ";"):
+            header = delimiter.join("xyz")
+            np.savetxt(
+                tmp_path / "a.txt", [[1, 2, 3], [4, 5, 6]], delimiter=delimiter, header=header
+            )
+            (one,) = read_csv(tmp_path / "a.txt")
+            assert one.landmarks.tolist() == [[1, 2, 3], [4, 5, 6]] and one.id is None
+        (one,) = read_csv(file("# two words\n1 2\n3 4\n", "b.txt"))
+        assert one.landmarks.tolist() == [[1, 2], [3, 4]] and one.id == "b"
+        with pytest.raises(ValueError, match="line 3: expected 2 cells as in the header, found 3"):
+            read_csv(file("# x y\n1 2\n3 4 5\n", "b.txt"))
 
     def test_coordinates_that_are_numbered_through(self, file):
         content = (

@@ -47,6 +47,8 @@ _COUNTED = re.compile(
 _NAMED = re.compile(r"(?P<name>.+)[\s._-]+(?P<axis>[xyz])")
 """nasion_x."""
 
+_ONE_SET = "Delete or rename the columns of the others."
+
 _CURE = "Pass the `decimal` sign, or name the codes of `missing` values."
 
 
@@ -69,9 +71,10 @@ def read_csv(
     read as well. *Long*: columns x, y (and z). Further columns go to `Specimen.notes`, in the long
     layout those that are constant within each specimen.
 
-    Empty cells and columns at the end do not matter. A first column without a name holds the names
-    of the rows, which in a wide table without a column `id` are those of the specimens. Two columns
-    of numbers without a header are the points of one specimen, which has the name of the file.
+    Empty cells and columns at the end do not matter, nor do lines of comment (#) above the header,
+    which may be one. A first column without a name holds the names of the rows, which in a wide
+    table without a column `id` are those of the specimens. Two columns of numbers without a header
+    are the points of one specimen, which has the name of the file.
 
     **Arguments:**
 
@@ -108,6 +111,9 @@ def read_csv(
     table = read_table(path, delimiter, encoding)
     wide = _wide_columns(table, dim)
     long = _long_columns(table)
+    if wide and long:
+        found = f"those of {list(long.values())[0]!r} and {wide[0]!r}"
+        fail(path, 1, "one set of coordinates", found, _ONE_SET)
     columns = wide or list(long.values())
     if not columns:
         columns = _bare_columns(table)
@@ -206,58 +212,40 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
     if delimiter is not None:
         check_delimiter(delimiter)
     content = read_text(path, encoding)
-    said = re.match(r"sep=(.)\r?\n", content)  # for a spreadsheet program
-    if said:
-        content = content[said.end() :]
-        delimiter = delimiter or said[1]
-    delimiter = delimiter or _delimiter_of(content)
-    records = []
-    reader = _reader(content, delimiter)
-    try:
-        for cells in reader:
-            if any(cell.strip() for cell in cells):
-                line = reader.line_num + bool(said)
-                records.append((line, [cell.strip() for cell in cells]))
-    except csv.Error as error:
-        fail(
-            path,
-            reader.line_num,
-            "cells of a table",
-            f"something else ({error})",
-            "Close all quotes.",
-        )
+    above = re.findall(r"\A(?:(?:sep=.|#.*)\n)*", content.replace("\r\n", "\n"))[0].splitlines()
+    content = content.split("\n", len(above))[-1]
+    said = [line[4] for line in above if line.startswith("sep=")]  # for a spreadsheet program
+    if delimiter is None:
+        delimiter = str(said[0]) if said else _delimiter_of(content)
+    records = _records(path, content, delimiter, len(above))
     if not records:
-        fail(
-            path, 1, "a header such as id,x1,y1,x2,y2", "nothing", "Write the names of the columns."
-        )
-    bare = all(_is_number(cell) for cell in records[0][1])
-    if bare:
-        header = [str(j) for j in range(1, len(records[0][1]) + 1)]
+        cure = "Write the names of the columns."
+        fail(path, 1, "a header such as id,x1,y1,x2,y2", "nothing", cure)
+    began, header = records[0]
+    bare = all(_is_number(cell) for cell in header)
+    if not bare:
+        records = records[1:]
+        header = _without_empty_end(header, 1)
+        if not records:
+            cure = "Export the table again."
+            fail(path, began + 1, "at least one row", "the end of the file", cure)
+    elif above and _has_axes(names := above[-1].lstrip("# ").split(delimiter), len(header)):
+        bare = False  # the header is a comment, as NumPy writes it
+        header = [name.strip() for name in names]
     else:
-        _, header = records.pop(0)
-        while not header[-1]:
-            header = header[:-1]
-    if not records:
-        line = reader.line_num + 1 + bool(said)
-        fail(path, line, "at least one row", "the end of the file", "Export the table again.")
+        header = [str(j + 1) for j in range(len(header))]
     records = [(line, _without_empty_end(cells, len(header))) for line, cells in records]
     if not bare and all(len(cells) == len(header) + 1 for _, cells in records):
         header = ["", *header]  # as R writes the names of rows
+    kept = [j for j, name in enumerate(header) if name or j == 0]
     for line, cells in records:
         if len(cells) != len(header):
             cure = "Quote cells that contain the delimiter; leave missing cells empty."
             fail(path, line, f"{len(header)} cells as in the header", f"{len(cells)}", cure)
-    kept = [j for j, name in enumerate(header) if name or j == 0]
-    for line, cells in records:
         for j, cell in enumerate(cells):
             if cell and j not in kept:
-                fail(
-                    path,
-                    line,
-                    f"nothing in column {j + 1}, which has no name",
-                    repr(cell),
-                    "Name it.",
-                )
+                expected = f"nothing in column {j + 1}, which has no name"
+                fail(path, line, expected, repr(cell), "Write its name.")
     header = [header[j] for j in kept]
     twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
@@ -267,6 +255,28 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
         for line, cells in records
     ]
     return Table(path, header, rows, delimiter, bare)
+
+
+def _records(
+    path: str | PathLike, content: str, delimiter: str, num_above: int
+) -> list[tuple[int, list[str]]]:
+    """Stripped cells of the lines that have any, and the number of their (last) line."""
+    reader = _reader(content, delimiter)
+    try:
+        records = [
+            (reader.line_num + num_above, [cell.strip() for cell in cells]) for cells in reader
+        ]
+    except csv.Error as error:
+        line = reader.line_num + num_above
+        fail(path, line, "cells of a table", f"something else ({error})", "Close all quotes.")
+    return [(line, cells) for line, cells in records if any(cells)]
+
+
+def _has_axes(names: list[str], count: int) -> bool:
+    """Whether these can be the names of so many columns, x and y or numbered ones among them."""
+    plain = [_plain(name.strip()) for name in names]
+    numbered = any(pattern.fullmatch(name) for name in plain for pattern in _NUMBERED)
+    return len(names) == count and (numbered or {"x", "y"} <= set(plain))
 
 
 def _reader(content: str, delimiter: str):
@@ -321,13 +331,7 @@ def _wide_columns(table: Table, dim: int | None) -> list[str]:
         return []
     if len(whole) > 1:
         found = " and ".join(repr(places[0][2]) for places in whole)
-        fail(
-            table.path,
-            1,
-            "one set of coordinates",
-            f"those of {found}",
-            "Delete or rename the others.",
-        )
+        fail(table.path, 1, "one set of coordinates", f"those of {found}", _ONE_SET)
     columns = {}
     for i, axis, name in whole[0]:
         if (i, axis) in columns:

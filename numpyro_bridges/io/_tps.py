@@ -48,10 +48,11 @@ def read_tps(
     """Specimens of a tps file, in its order.
 
     Keys may be in any case; blank lines and blanks at the end of a line do not matter, nor do lines
-    of comment before the first LM=. OUTLINES are curves, after those of CURVES. Keys other than LM,
-    LM3, CURVES, OUTLINES, POINTS, IMAGE, ID and SCALE (COMMENT, VARIABLES, ...) are kept in
-    `Specimen.notes`, one that comes twice with its texts on two lines; those that carry rows of
-    numbers (RADII) are refused. SCALE is reported, not applied; one that is empty or NA is none.
+    of comment: those before the first LM=, and those that begin with #. OUTLINES are curves, after
+    those of CURVES. Keys other than LM, LM3, CURVES, OUTLINES, POINTS, IMAGE, ID and SCALE
+    (COMMENT, VARIABLES, ...) are kept in `Specimen.notes`, one that comes twice with its texts on
+    two lines; those that carry rows of numbers (RADII) are refused. SCALE is reported, not applied;
+    one that is empty or NA is none.
 
     **Arguments:**
 
@@ -105,7 +106,7 @@ class _Lines:
         if any(key in _RESERVED or _is_row(every[i]) for i, key in enumerate(keys[:first])):
             first = 0  # more than a comment: the first specimen says what is wrong
         numbered = enumerate(every[first:], start=first + 1)
-        self._rest = ((i, line) for i, line in numbered if line)
+        self._rest = ((i, line) for i, line in numbered if line and not _is_comment(line))
         self._num_lines = len(every)
         self.advance()
 
@@ -127,6 +128,10 @@ def _key(line: str) -> str:
     """What stands before the first =, in upper case."""
     key, equals, _ = line.partition("=")
     return key.strip().upper() if equals else ""
+
+
+def _is_comment(line: str) -> bool:
+    return line.startswith("#") and "=" not in line
 
 
 def _is_row(line: str) -> bool:
