@@ -24,6 +24,9 @@ _FAR = 2.0
 _USUAL = 3.0
 """How far off a mirrored shape must be, in distances of most."""
 
+_MOST = 0.75
+"""Mirror images are told where so many shapes are either; else they bend to one side or the other."""
+
 _SEEN = 1e-3
 """Distances below this part of the size of the mean are not looked at."""
 
@@ -126,8 +129,9 @@ def procrustes_align(
 
     A specimen that was seen from the other side, or whose y points down, is *mirrored*: a
     `UserWarning` names it. Its mirror image is at most half as far from the mean as itself, which
-    is three times as far off as most. With a `reference` it is mirrored to that, otherwise to the
-    majority, or to the first of two halves.
+    is three times as far off as most; and three quarters of the shapes are far like this from their
+    own mirror images or those of others, so that they do not just bend to one side or the other. With
+    a `reference` it is mirrored to that, otherwise to the majority, or to the first of two halves.
 
     **Arguments:**
 
@@ -291,7 +295,9 @@ def _mirrored(shapes: NDArray, seen: NDArray, start: NDArray, first: int | None)
     rotated = (_FAR * by_rotation <= by_reflection) & (by_reflection > max(usual, _SEEN))
     reflected = (_FAR * by_reflection <= by_rotation) & (by_rotation > max(usual, _SEEN))
     told = np.flatnonzero(rotated | reflected)
-    if first is None or rotated.sum() > reflected.sum() or not told.size:
+    if told.size < _MOST * len(shapes):
+        return np.zeros(len(shapes), bool)
+    if first is None or rotated.sum() > reflected.sum():
         return reflected
     halves = rotated.sum() == reflected.sum()
     return reflected if halves and rotated[told[0]] else rotated

@@ -402,6 +402,7 @@ LONG = {
         "id\tPoint\tX (px)\tY (px)\na\t3\t5\t6.25\nb\t1\t.5\t0\na\t1\t1\t2\na\t2\t3.5\t-4\n"
         "b\t3\t-2.5\t7\nb\t2\t10\t11\n"
     ),
+    "counted": "id,row,x,y\na,1,1,2\na,2,3.5,-4\na,3,5,6.25\nb,4,.5,0\nb,5,10,11\nb,6,-2.5,7\n",
     "labels": "id,lm,x,y\na,p,1,2\na,q,3.5,-4\na,r,5,6.25\nb,p,.5,0\nb,q,10,11\nb,r,-2.5,7\n",
 }
 

@@ -215,6 +215,7 @@ class TestMirrorImages:
         mended = shapes.procrustes_align(specimens, reflect="auto")  # without a word
         assert np.flatnonzero(mended.mirrored).tolist() == few
         np.testing.assert_allclose(mended.distances, right.distances, atol=1e-9)
+        assert mended.num_iterations == right.num_iterations
         assert mended.names == tuple(f"w{i}" for i in range(12))
 
     def test_missing_points_and_sizes(self, rng):
@@ -243,6 +244,17 @@ class TestMirrorImages:
         flat = (rng.normal(size=(1, 12, 3)) + 0.1 * noise) * [1.0, 1.0, 0.0]
         for some in (line, flat, flat + 1e-3 * noise, noise, noise[..., :2]):
             assert not shapes.procrustes_align(some, max_iterations=1000).mirrored.any()
+
+    def test_bends_to_both_sides_are_no_mirror_images(self, rng):
+        """Near to the mirror image by chance, as most are; and a strong bend, not much nearer to it."""
+        s = np.linspace(-1.0, 1.0, 12)
+
+        def bent(by):
+            return np.stack([np.broadcast_to(s, (len(by), 12)), np.outer(by, s**2)], axis=-1)
+
+        assert not shapes.procrustes_align(bent(0.02 + 0.1 * rng.normal(size=40))).mirrored.any()
+        found = shapes.procrustes_align(bent(np.r_[0.05 + 0.01 * rng.normal(size=20), -0.4]))
+        assert not found.mirrored.any() and np.flatnonzero(found.outliers).tolist() == [20]
 
     def test_a_long_list_is_cut_short(self, rng):
         _, copies = scatter(rng, num_shapes=30, noise=0.02)
@@ -295,6 +307,14 @@ class TestNoCompleteShape:
         np.testing.assert_allclose(onto, complete.mean, atol=1e-8)
         seen = np.where(missing[1][:, None], np.nan, shapes.unit_size(copies[1]))
         np.testing.assert_allclose(found.shapes[1], seen, atol=1e-8)  # the first with one missing
+
+    def test_several_fill_up_the_first(self, rng):
+        _, copies = scatter(rng, num_shapes=3, dim=3, noise=0.0)
+        holed = copies.copy()
+        for shape, gone in zip(holed, ([0, 1], [1, 2], [0, 2]), strict=True):
+            shape[gone] = np.nan
+        found = shapes.procrustes_align(holed)
+        np.testing.assert_allclose(found.mean, shapes.procrustes_align(copies).mean, atol=1e-8)
 
     def test_says_when_it_cannot(self, rng):
         _, copies = scatter(rng, num_shapes=2, num_points=6)
