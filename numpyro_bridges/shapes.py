@@ -25,7 +25,7 @@ _USUAL = 3.0
 """How far off a mirrored shape must be, in distances of most."""
 
 _MOST = 0.75
-"""Mirror images are told where so many shapes are either; else they bend to one side or the other."""
+"""Mirror images are told where so many shapes are either; else shapes bend to both sides."""
 
 _SEEN = 1e-3
 """Distances below this part of the size of the mean are not looked at."""
@@ -130,8 +130,8 @@ def procrustes_align(
     A specimen that was seen from the other side, or whose y points down, is *mirrored*: a
     `UserWarning` names it. Its mirror image is at most half as far from the mean as itself, which
     is three times as far off as most; and three quarters of the shapes are far like this from their
-    own mirror images or those of others, so that they do not just bend to one side or the other. With
-    a `reference` it is mirrored to that, otherwise to the majority, or to the first of two halves.
+    own mirror images or those of others, so that they do not just bend to both sides. With a
+    `reference` it is mirrored to that, otherwise to the majority, or to the first of two halves.
 
     **Arguments:**
 
@@ -214,7 +214,8 @@ def procrustes_align(
     if not converged:
         warnings.warn(
             f"alignment did not converge in `max_iterations={max_iterations}`: the mean still "
-            f"moves by more than {tolerance:g} of its size. Are points in the same order in all shapes?",
+            f"moves by more than {tolerance:g} of its size. Are points in the same order in all "
+            "shapes?",
             stacklevel=2,
         )
     if first is not None:

@@ -238,7 +238,7 @@ class TestMirrorImages:
         np.testing.assert_allclose(found.shapes[0], shapes.unit_size(copies[0]), atol=1e-12)
 
     def test_no_false_alarms(self, rng):
-        """Of shapes that are nearly their own mirror images, flat in space, or nothing but noise."""
+        """Of shapes that are nearly their own mirror images, flat in space, or mere noise."""
         noise = rng.normal(size=(20, 12, 3))
         line = rng.normal(size=(1, 12, 2)) * [1.0, 0.0] + 1e-3 * noise[..., :2]
         flat = (rng.normal(size=(1, 12, 3)) + 0.1 * noise) * [1.0, 1.0, 0.0]
@@ -246,7 +246,7 @@ class TestMirrorImages:
             assert not shapes.procrustes_align(some, max_iterations=1000).mirrored.any()
 
     def test_bends_to_both_sides_are_no_mirror_images(self, rng):
-        """Near to the mirror image by chance, as most are; and a strong bend, not much nearer to it."""
+        """Nearer to the mirror image, as many are; and a strong bend, not much nearer to it."""
         s = np.linspace(-1.0, 1.0, 12)
 
         def bent(by):
@@ -325,7 +325,7 @@ class TestNoCompleteShape:
 
     def test_names_the_specimen(self):
         few = io.Specimen([[1.0, 2.0], [np.nan, 3.0], [np.nan, 1.0]], id="crushed")
-        with pytest.raises(ValueError, match=r"`shapes\[1\]` \('crushed'\) must have at least 2 seen"):
+        with pytest.raises(ValueError, match=r"`shapes\[1\]` \('crushed'\) must have at least 2"):
             shapes.procrustes_align([io.Specimen(np.eye(3)[:, :2], id="whole"), few])
         with pytest.raises(ValueError, match=r"`specimens\[1\]` \('crushed'\) has 3 landmarks"):
             shapes.procrustes_align([io.Specimen(np.eye(2), id="whole"), few])
@@ -369,7 +369,7 @@ def test_rats_turn_back_from_their_registration(shared_data):
 
 
 def test_real_shapes_raise_no_alarm(shared_data):
-    """Three dimensions, large differences between species, 911 wings; one that is mirrored is found."""
+    """In space too, with large differences between species; one of 911 that is mirrored is found."""
     with np.load(shared_data / "steinmanella" / "steinmanella.npz") as data:
         shells = data["shapes"]
     with np.load(shared_data / "ptychomya" / "outlines.npz") as data:

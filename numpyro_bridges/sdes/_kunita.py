@@ -173,10 +173,11 @@ class KunitaFlow(AbstractSDE):
     def point_sd(self, t: RealScalar = 1.0) -> Float[Array, ""]:
         """The standard deviation of a coordinate of a point after a time t: √(t a(x, x)).
 
-        It is what an amplitude means, in the units of the shapes: for the Gaussian kernel in the plane
-        √(π t) αℓ. It is exact at every t, as a point that the flow carries is a martingale whose noise has the
-        covariance a(x, x) wherever it is. What spectral or grid noise leaves out of a(x, x), `noise_error` says; a
-        point of a curve in a `FourierBasis` moves less, by what the basis leaves out of the noise.
+        It is what an amplitude means, in the units of the shapes: for the Gaussian kernel in the
+        plane √(π t) αℓ. It is exact at every t, as a point that the flow carries is a martingale
+        whose noise has the covariance a(x, x) wherever it is. What spectral or grid noise leaves out
+        of a(x, x), `noise_error` says; a point of a curve in a `FourierBasis` moves less, by what the
+        basis leaves out of the noise.
 
         **Arguments:** `t`: from 0 on.
         """
