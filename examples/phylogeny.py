@@ -8,7 +8,7 @@
 #
 #     python examples/phylogeny.py --shapes wings.tps --tree tree.nwk                      # ID= is the species
 #     python examples/phylogeny.py --shapes wings.csv --names species --tree tree.nex
-#     python examples/phylogeny.py --shapes wings.tps --table specimens.csv --names tip --tree tree.nwk
+#     python examples/phylogeny.py --shapes wings.tps --table specimens.csv --by specimen --names tip --tree tree.nwk
 #     python examples/phylogeny.py ... --quick       # under a minute, to see that all runs
 #     python examples/phylogeny.py ... --run saved   # saved as it goes; after a kill the same line goes on from there
 #
@@ -17,8 +17,6 @@
 
 # %%
 import argparse
-import csv
-import gzip
 import os
 import time
 from pathlib import Path
@@ -63,8 +61,9 @@ def options(description, **defaults):
 
 
 def files(parser, required):
-    parser.add_argument("--shapes", type=Path, required=required, help="a tps or CSV file, also .gz")
+    parser.add_argument("--shapes", type=Path, required=required, help="a file that `io.read` reads")
     parser.add_argument("--table", type=Path, help="a CSV file with a row for each specimen, for columns of its own")
+    parser.add_argument("--by", help="the column of that table with the ids; without it, row is for row")
 
 
 def settings(arguments):
@@ -293,23 +292,15 @@ def read(arguments):
 
 def read_shapes(arguments):
     """Shapes `(N, n, dim)` as the file has them, NaN where a point is missing, and what it says of each, by column."""
-    file = arguments.shapes
-    tps = Path(file.stem if file.suffix == ".gz" else file.name).suffix.lower() == ".tps"
-    specimens = nb.io.read_tps(file) if tps else nb.io.read_csv(file)
-    rows = [{"id": specimen.id} | dict(specimen.notes) for specimen in specimens]
+    specimens = nb.io.read(arguments.shapes)
     if arguments.table is not None:
-        opened = gzip.open if arguments.table.suffix == ".gz" else open
-        with opened(arguments.table, "rt", encoding="utf-8", newline="") as table:
-            rows = list(csv.DictReader(table))
-    if len(rows) != len(specimens):
-        raise ValueError(f"--table must have a row for each of {len(specimens)} specimens; got {len(rows)}.")
-    shapes = [np.concatenate([specimen.landmarks, *specimen.curves]) for specimen in specimens]
-    if len({len(shape) for shape in shapes}) > 1:
-        raise ValueError(f"{file}: all shapes must have the same points; got {sorted(set(map(len, shapes)))}.")
-    count = len(shapes[0])
+        specimens = nb.io.join(specimens, arguments.table, by=arguments.by)
+    rows = [{"id": specimen.id} | dict(specimen.notes) for specimen in specimens]
+    shapes = nb.io.stack(specimens).shapes
+    count = shapes.shape[1]
     num_points = min(arguments.points, count)
     chosen = np.linspace(0, count - 1 if arguments.open else count, num_points, endpoint=arguments.open)
-    return np.stack(shapes)[:, np.round(chosen).astype(int)], rows
+    return shapes[:, np.round(chosen).astype(int)], rows
 
 
 def column_of(rows, column, option):

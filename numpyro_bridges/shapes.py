@@ -1,16 +1,37 @@
 """Preparation of shapes: equal spacing, position, size, rotation, start point, mean.
-
-A shape is an array (n, d) of n points in R^d, d = 2 or 3. Everything here is plain NumPy in float64 and runs
-before inference. Size is the RMS radius r(x) = (1/n Σ_i |x_i − x̄|²)^½, which does not grow with the number
-of points (the centroid size of morphometrics is √n r).
+ A shape is an array (n, d) of n points in R^d, d = 2 or 3. Everything here is plain NumPy in
+float64 and runs before inference. Size is the RMS radius r(x) = (1/n Σ_i |x_i − x̄|²)^½, which does
+not grow with the number of points (the centroid size of morphometrics is √n r).
 """
 
-from typing import NamedTuple
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ._checks import flag, known_float, known_number, positive_integer
+from ._checks import choice, flag, known_float, known_number, positive_integer
+from .io import Specimen, stack
+
+_ROUNDS = 5
+"""Rotations onto a mean that show which shapes are mirrored."""
+
+_FAR = 2.0
+"""How much nearer a mirror image must be, and how much farther off than usual an outlier."""
+
+_USUAL = 3.0
+"""How far off a mirrored shape must be, in distances of most."""
+
+_MOST = 0.75
+"""Mirror images are told where so many shapes are either; else shapes bend to both sides."""
+
+_SEEN = 1e-3
+"""Distances below this part of the size of the mean are not looked at."""
+
+_DEVIATIONS = 5.0
+"""Robust standard deviations of log distances beyond which there are outliers."""
 
 
 def resample(points: ArrayLike, num_points: int, closed: bool = True) -> NDArray:
@@ -18,13 +39,15 @@ def resample(points: ArrayLike, num_points: int, closed: bool = True) -> NDArray
 
     **Arguments:**
 
-    - `points`: (n, d) vertices in order. Repeated vertices are allowed, also a last one that repeats the
-      first.
+    - `points`: (n, d) vertices in order. Repeated vertices are allowed, also a last one that
+      repeats the first.
     - `num_points`: how many points to return.
-    - `closed`: whether an edge joins the last vertex to the first. A closed curve of length ℓ is sampled at i
-      ℓ/num_points (its start is not repeated), an open one at i ℓ/(num_points − 1), both ends included.
+    - `closed`: whether an edge joins the last vertex to the first. A closed curve of length ℓ is
+      sampled at i ℓ/num_points (its start is not repeated), an open one at i ℓ/(num_points − 1),
+      both ends included.
 
-    **Returns:** (num_points, d). Spacing is even along the polygon; chords across its corners are shorter.
+    **Returns:** (num_points, d). Spacing is even along the polygon; chords across its corners are
+    shorter.
 
     **Raises:** `ValueError` for missing (NaN) points, a curve of no length, or too few points.
     """
@@ -55,83 +78,131 @@ def unit_size(points: ArrayLike) -> NDArray:
     return _unit_size(center(points), "points")
 
 
-class Alignment(NamedTuple):
-    """What `procrustes_align` returns.
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """What `procrustes_align` returns. As a tuple it is `(shapes, mean, num_iterations,
+    converged)`.
 
     - `shapes`: (N, n, d) aligned shapes, NaN where a point is missing.
     - `mean`: (n, d), without NaN; of unit RMS radius where `scale` is true.
     - `num_iterations`: rotations of all shapes onto a mean.
     - `converged`: whether the last iteration moved the mean by less than the tolerance.
+    - `distances`: (N,) RMS distance of the seen points of each shape from the mean, in RMS radii of
+      the mean.
+    - `outliers`: (N,) whether that distance is at least twice the median one, and its logarithm is
+      more than five robust standard deviations above the median. None among fewer than five.
+    - `mirrored`: (N,) whether the mirror image of a shape fits far better: see `procrustes_align`.
+    - `names`: of the specimens, `None` where there are none.
     """
 
     shapes: NDArray
     mean: NDArray
     num_iterations: int
     converged: bool
+    distances: NDArray
+    outliers: NDArray
+    mirrored: NDArray
+    names: tuple[str | None, ...]
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.shapes, self.mean, self.num_iterations, self.converged))
 
 
 def procrustes_align(
-    shapes: ArrayLike,
+    shapes: ArrayLike | Iterable[Specimen],
     reference: ArrayLike | None = None,
     scale: bool = True,
     *,
+    reflect: str = "warn",
     tolerance: float = 1e-10,
     max_iterations: int = 200,
 ) -> Alignment:
     """Generalised Procrustes alignment: shapes centred, sized and rotated onto their common mean.
 
-    Minimises Σ_i ‖x_i R_i − x̄‖² over rotations R_i (det R_i = 1: mirror images stay apart) by turns: rotate
-    every shape onto the mean, average (Gower 1975). With `scale`, every shape is first given unit RMS radius,
-    and so is the mean (partial Procrustes: each shape keeps size one rather than being shrunk onto the mean).
+    Minimises Σ_i ‖x_i R_i − x̄‖² over rotations R_i (det R_i = 1: mirror images stay apart) by
+    turns: rotate every shape onto the mean, average (Gower 1975). With `scale`, every shape is
+    first given unit RMS radius, and so is the mean (partial Procrustes: each shape keeps size one
+    rather than being shrunk onto the mean).
 
-    A point with a NaN coordinate is missing. In every iteration it is filled with the mean, fitted to the seen
-    points of its shape by translation, rotation and size; it is returned as NaN.
+    A point with a NaN coordinate is missing. In every iteration it is filled with the mean, fitted
+    to the seen points of its shape by translation, rotation and size; it is returned as NaN.
+
+    A specimen that was seen from the other side, or whose y points down, is *mirrored*: a
+    `UserWarning` names it. Its mirror image is at most half as far from the mean as itself, which
+    is three times as far off as most; and three quarters of the shapes are far like this from their
+    own mirror images or those of others, so that they do not just bend to both sides. With a
+    `reference` it is mirrored to that, otherwise to the majority, or to the first of two halves.
 
     **Arguments:**
 
-    - `shapes`: (N, n, d), row j of each shape being the same place.
-    - `reference`: (n, d). Given, shapes are rotated onto it once and the mean is the average of the result.
-      Without it the first shape without missing points begins the iteration, and keeps its orientation in the
-      result.
+    - `shapes`: (N, n, d), row j of each shape being the same place; or `Specimen`s, of which
+      `io.stack` makes such an array.
+    - `reference`: (n, d). Given, shapes are rotated onto it once and the mean is the average of the
+      result. Without it the first shape without missing points begins the iteration, and keeps its
+      orientation in the result; if there is none, the first of the least incomplete ones, filled up
+      by others that share the most points with it.
     - `scale`: whether size is removed.
+    - `reflect`: `"warn"` leaves shapes that are mirrored as they are, and tells of them; `"auto"`
+      reflects them, without a word but in the result's `mirrored`.
     - `tolerance`: stops once the mean moves by less, as a fraction of its RMS radius.
-    - `max_iterations`: after these `converged` is false.
+    - `max_iterations`: after these `converged` is false, and a `UserWarning` says so.
 
     **Returns:** an `Alignment`.
 
-    **Raises:** `ValueError` for a wrong shape, a shape with fewer than d seen points, or no shape to begin
-    from.
+    **Raises:** `ValueError` for a wrong shape, specimens that differ in their points, a shape with
+    fewer than d seen points, or no shape to begin from.
     """
     scale = flag(scale, "scale")
+    choice(reflect, "reflect", ("warn", "auto"))
     max_iterations = positive_integer(max_iterations, "max_iterations")
     tolerance = known_number(tolerance, "tolerance", "a number from 0 on", lambda value: value >= 0)
-    shapes = known_float(shapes, "shapes")
+    shapes, names = _with_names(shapes)
     if shapes.ndim != 3 or shapes.shape[-1] not in (2, 3) or 0 in shapes.shape:
-        raise ValueError(f"`shapes` must have the shape (N, n, 2) or (N, n, 3), got {shapes.shape}.")
+        raise ValueError(
+            f"`shapes` must have the shape (N, n, 2) or (N, n, 3), got {shapes.shape}."
+        )
     if np.any(np.isinf(shapes)):
-        raise ValueError("`shapes` must be finite, or NaN where a point is missing; got infinite coordinates.")
-    _, num_points, dim = shapes.shape
+        raise ValueError(
+            "`shapes` must be finite, or NaN where a point is missing; got infinite coordinates."
+        )
+    count, num_points, dim = shapes.shape
+    names = names or (None,) * count
     missing: NDArray = np.any(np.isnan(shapes), axis=-1)
     num_seen = num_points - missing.sum(axis=1)
     if num_seen.min() < dim:
         worst = int(num_seen.argmin())
         raise ValueError(
-            f"`shapes[{worst}]` must have at least {dim} seen points, got {num_seen[worst]}: leave it out."
+            f"{_called(names, worst)} must have at least {dim} seen points, got {num_seen[worst]}: "
+            "leave it out."
         )
+    first = None
+    if reference is None:
+        first, start = _least_incomplete(shapes, missing)
+    else:
+        start = _shape(reference, "reference")
+        if start.shape != (num_points, dim):
+            raise ValueError(
+                f"`reference` must have the shape {(num_points, dim)}, got {start.shape}."
+            )
+    mirrored = _mirrored(shapes, ~missing, start, first)
+    if reflect == "auto":
+        other_side = np.r_[-1.0, np.ones(dim - 1)]
+        shapes = np.where(mirrored[:, None, None], shapes * other_side, shapes)
+        start = start * other_side if first is not None and mirrored[first] else start
+    elif mirrored.any():
+        listed = ", ".join(_called(names, i) for i in np.flatnonzero(mirrored)[:8])
+        more = f" and {mirrored.sum() - 8} more" if mirrored.sum() > 8 else ""
+        warnings.warn(
+            f"the mirror image fits far better: {listed}{more}. Seen from the other side, or y "
+            "pointing down? Leave them out, correct them, or let them be reflected by "
+            '`reflect="auto"`.',
+            stacklevel=2,
+        )
+
     def standard(points: NDArray, name: str) -> NDArray:
         return _unit_size(center(points), name) if scale else center(points)
 
-    if reference is None:
-        complete = np.flatnonzero(~np.any(missing, axis=1))
-        if complete.size == 0:
-            raise ValueError("`shapes` must have one without missing points, or give a `reference`.")
-        first = complete[0]
-        mean = standard(shapes[first], f"shapes[{first}]")
-    else:
-        mean = standard(_shape(reference, "reference"), "reference")
-        if mean.shape != (num_points, dim):
-            raise ValueError(f"`reference` must have the shape {(num_points, dim)}, got {mean.shape}.")
-
+    mean = standard(start, "reference" if first is None else f"shapes[{first}]")
     converged, iteration = False, 0
     while not converged and iteration < max_iterations:
         iteration += 1
@@ -139,16 +210,130 @@ def procrustes_align(
         aligned = filled @ _rotations(filled, mean)
         previous, mean = mean, standard(aligned.mean(axis=0), "shapes")
         change = np.sqrt(np.mean(np.sum((mean - previous) ** 2, axis=-1)))
-        converged = reference is not None or bool(change <= tolerance * rms_radius(mean))
-
-    if reference is None:
+        converged = first is None or bool(change <= tolerance * rms_radius(mean))
+    if not converged:
+        warnings.warn(
+            f"alignment did not converge in `max_iterations={max_iterations}`: the mean still "
+            f"moves by more than {tolerance:g} of its size. Are points in the same order in all "
+            "shapes?",
+            stacklevel=2,
+        )
+    if first is not None:
         back = _rotations(aligned[first], filled[first])
         aligned, mean = aligned @ back, mean @ back
     aligned[missing] = np.nan
-    return Alignment(aligned, mean, iteration, converged)
+    squares = np.sum((aligned - mean) ** 2, axis=-1)
+    distances = np.sqrt(np.nanmean(squares, axis=1)) / rms_radius(mean)
+    outliers = _far_off(distances)
+    return Alignment(aligned, mean, iteration, converged, distances, outliers, mirrored, names)
 
 
-def mean_shape(shapes: ArrayLike, scale: bool = True) -> NDArray:
+def _with_names(shapes: Any) -> tuple[NDArray, tuple[str | None, ...]]:
+    """An array, and the names of specimens; none of an array."""
+    if isinstance(shapes, (list, tuple)) and any(isinstance(one, Specimen) for one in shapes):
+        stacked = stack(shapes)
+        return stacked.shapes, tuple(stacked.names)
+    return known_float(shapes, "shapes"), ()
+
+
+def _called(names: tuple[str | None, ...], i: int) -> str:
+    """How messages speak of one of several shapes."""
+    return f"`shapes[{i}]`" + (f" ({names[i]!r})" if names[i] is not None else "")
+
+
+def _least_incomplete(shapes: NDArray, missing: NDArray) -> tuple[int, NDArray]:
+    """The first shape with the fewest missing points, and itself with these filled in.
+
+    They come from other shapes, that with the most points in common first, fitted by translation,
+    rotation and size.
+    """
+    never = np.flatnonzero(missing.all(axis=0))
+    if never.size:
+        raise ValueError(
+            f"`shapes` must have each point in one shape at least; {never.tolist()} are missing in "
+            "all. Leave these points out, or give a `reference`."
+        )
+    first = int(missing.sum(axis=1).argmin())
+    filled, gone = shapes[first].copy(), missing[first].copy()
+    while gone.any():
+        common = np.sum(~gone & ~missing, axis=1)
+        common[~np.any(gone & ~missing, axis=1)] = 0  # it has none of those that are sought
+        other = int(common.argmax())
+        if common[other] < shapes.shape[-1]:
+            raise ValueError(
+                "`shapes` must overlap: no two have enough points in common to begin from. "
+                "Give a `reference`."
+            )
+        seen = ~missing[other]
+        filled[seen] = _fill(filled[None, seen], gone[None, seen], shapes[other, seen])[0]
+        gone &= missing[other]
+    return first, filled
+
+
+def _mirrored(shapes: NDArray, seen: NDArray, start: NDArray, first: int | None) -> NDArray:
+    """Which shapes (N,) are mirror images of most, or of the start where that is a reference.
+
+    The mean of shapes some of which are mirrored is flat, and tells nothing. So all are brought
+    onto a mean by rotations and reflections, and then those are told apart that are near to it by
+    the one or the other.
+    """
+    mean = start
+    for _ in range(0 if first is None else _ROUNDS):
+        x, onto, size, place = _in_common(shapes, seen, mean)
+        u, _, vt = np.linalg.svd(np.swapaxes(x, -1, -2) @ onto)
+        fitted = size * x @ (u @ vt) + place
+        mean = np.nanmean(np.where(seen[..., None], fitted, np.nan), axis=0)
+    x, onto, _, _ = _in_common(shapes, seen, mean)
+    u, values, vt = np.linalg.svd(np.swapaxes(x, -1, -2) @ onto)
+    best = values.sum(axis=-1)
+    of_other_hand = best - 2.0 * values[:, -1]
+    rotates = np.linalg.det(u @ vt) > 0.0
+    cosines = np.where(rotates, best, of_other_hand), np.where(rotates, of_other_hand, best)
+    by_rotation, by_reflection = (
+        np.sqrt(1.0 - np.clip(cosine, 0.0, 1.0) ** 2) for cosine in cosines
+    )
+    usual = _USUAL * np.median(np.minimum(by_rotation, by_reflection))
+    rotated = (_FAR * by_rotation <= by_reflection) & (by_reflection > max(usual, _SEEN))
+    reflected = (_FAR * by_reflection <= by_rotation) & (by_rotation > max(usual, _SEEN))
+    told = np.flatnonzero(rotated | reflected)
+    if told.size < _MOST * len(shapes):
+        return np.zeros(len(shapes), bool)
+    if first is None or rotated.sum() > reflected.sum():
+        return reflected
+    halves = rotated.sum() == reflected.sum()
+    return reflected if halves and rotated[told[0]] else rotated
+
+
+def _in_common(
+    shapes: NDArray, seen: NDArray, mean: NDArray
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """The seen points of shapes, and the same of the mean, both centred and of unit size.
+
+    Those that are not seen are 0. Beside them the size and the place of the mean's points.
+    """
+
+    def centred(points: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        points = np.where(seen[..., None], points, 0.0)
+        place = points.sum(axis=1, keepdims=True) / seen.sum(axis=1)[:, None, None]
+        points = np.where(seen[..., None], points - place, 0.0)
+        size = np.linalg.norm(points, axis=(1, 2), keepdims=True)
+        return points / np.where(size > 0.0, size, 1.0), size, place
+
+    x, _, _ = centred(shapes)
+    onto, size, place = centred(np.broadcast_to(mean, shapes.shape))
+    return x, onto, size, place
+
+
+def _far_off(distances: NDArray) -> NDArray:
+    """Which distances are outliers, for their logarithms and by a robust standard deviation."""
+    logs = np.log(np.maximum(distances, _SEEN))
+    above = logs - np.median(logs)
+    spread = 1.4826 * np.median(np.abs(above))  # of a normal distribution the standard deviation
+    far = above > max(_DEVIATIONS * spread, np.log(_FAR))
+    return far & (len(distances) >= 5)
+
+
+def mean_shape(shapes: ArrayLike | Iterable[Specimen], scale: bool = True) -> NDArray:
     """Procrustes mean (n, d) of shapes (N, n, d), of unit RMS radius where `scale` is true."""
     return procrustes_align(shapes, scale=scale).mean
 
@@ -156,8 +341,8 @@ def mean_shape(shapes: ArrayLike, scale: bool = True) -> NDArray:
 def align_start(shapes: ArrayLike, reference: ArrayLike) -> NDArray:
     """Closed outlines numbered from the point that corresponds to the reference's first.
 
-    Of the n cyclic shifts of each outline, takes the one with the least Procrustes distance to `reference`
-    (rotations only). The direction of travel is left as it is.
+    Of the n cyclic shifts of each outline, takes the one with the least Procrustes distance to
+    `reference` (rotations only). The direction of travel is left as it is.
 
     **Arguments:**
 
@@ -170,7 +355,8 @@ def align_start(shapes: ArrayLike, reference: ArrayLike) -> NDArray:
     shapes = _shapes(shapes, "shapes")
     if shapes.shape[-2:] != reference.shape or shapes.ndim > 3:
         raise ValueError(
-            f"`shapes` must be one or several of the reference's shape {reference.shape}, got {shapes.shape}."
+            f"`shapes` must be one or several of the reference's shape {reference.shape}, got "
+            f"{shapes.shape}."
         )
     n = len(reference)
     shifts = (np.arange(n)[:, None] + np.arange(n)) % n
@@ -184,7 +370,8 @@ def align_start(shapes: ArrayLike, reference: ArrayLike) -> NDArray:
 
 
 def _rotations(shapes: NDArray, target: NDArray) -> NDArray:
-    """Kabsch's R (..., d, d), det R = 1, that minimise ‖x R − target‖ for centred shapes x (..., n, d)."""
+    """Kabsch's R (..., d, d), det R = 1, that minimise ‖x R − target‖ for centred shapes x (..., n,
+    d)."""
     u, _, vt = np.linalg.svd(np.swapaxes(shapes, -1, -2) @ target)
     u[..., -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return u @ vt
@@ -214,7 +401,9 @@ def _unit_size(points: NDArray, name: str) -> NDArray:
     """Centred shapes divided by their RMS radius."""
     size = rms_radius(points)
     if not np.all(size > 0.0):
-        raise ValueError(f"`{name}` must not all coincide: a shape without extent has no unit size.")
+        raise ValueError(
+            f"`{name}` must not all coincide: a shape without extent has no unit size."
+        )
     return points / size[..., None, None]
 
 

@@ -689,8 +689,9 @@ def table() -> dict[str, Row]:
             shapes=("array", SQUARED),
             reference=("array?", SQUARE),
             scale=("flag", True),
+            reflect=("name", "auto"),
             tolerance=("setting", 1e-8),
-            max_iterations=("count", 3),
+            max_iterations=("count", 50),
         ),
         "shapes.mean_shape": row(
             shapes.mean_shape, shapes=("array", SQUARED), scale=("flag", True)
@@ -711,9 +712,35 @@ def table() -> dict[str, Row]:
             io.read_csv,
             True,
             path=("path", FILE),
-            id=("text", "id"),
+            id="text?",
             point=("text", "point"),
-            delimiter=("text", ","),
+            delimiter="text?",
+            decimal="text?",
+            missing="free",
+            dim="count?",
+            encoding=("text", "utf-8"),
+        ),
+        **{
+            f"io.{reader.__name__}": row(
+                reader, True, path=("path", FILE), encoding=("text", "utf-8"), **more
+            )
+            for reader, more in (
+                (io.read, {"settings": "free"}),
+                (io.read_slicer, {}),
+                (io.read_nts, {}),
+                (io.read_morphologika, {"missing": "free"}),
+            )
+        },
+        "io.stack": row(
+            io.stack, specimens=("specimens", [SPECIMEN, SPECIMEN]), points=("name", "all")
+        ),
+        "io.join": row(
+            io.join,
+            specimens=("specimens", [SPECIMEN]),
+            table=("path", pd.DataFrame({"id": ["a"], "sex": ["f"]})),
+            by="text?",
+            of=("text", "id"),
+            delimiter="text?",
             encoding=("text", "utf-8"),
         ),
         "io.write_csv": row(
@@ -912,6 +939,7 @@ EXTENSION = {
 }
 MADE_BY_THE_LIBRARY = {
     "Alignment",
+    "Stack",
     "EvidenceEstimate",
     "TemperedEvidence",
     "Comparison",

@@ -34,7 +34,7 @@ for path, found in blocks[int(first) :: int(count)]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
-    [["extending.md"], ["guides.md", "scores.md", "trees.md", "troubleshooting.md"]],
+    [["extending.md"], ["data.md", "guides.md", "scores.md", "trees.md", "troubleshooting.md"]],
     ids=["extending", "others"],
 )
 def test_code_runs_as_it_stands(names, tmp_path):

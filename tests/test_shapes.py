@@ -142,7 +142,8 @@ class TestProcrustes:
     def test_rotates_but_never_reflects(self, rng):
         base, _ = scatter(rng)
         mirrored = base * [-1.0, 1.0]
-        aligned = shapes.procrustes_align(mirrored[None], reference=base).shapes[0]
+        with pytest.warns(UserWarning, match="the mirror image fits far better: `shapes.0.`"):
+            aligned = shapes.procrustes_align(mirrored[None], reference=base).shapes[0]
         sign = np.linalg.det(np.linalg.lstsq(shapes.unit_size(mirrored), aligned, rcond=None)[0])
         assert sign == pytest.approx(1.0)
         assert np.abs(aligned - shapes.unit_size(base)).max() > 0.1
@@ -170,7 +171,8 @@ class TestProcrustes:
 
     def test_reports_when_it_stops_early(self, rng):
         _, copies = scatter(rng, noise=1.0)
-        stopped = shapes.procrustes_align(copies, max_iterations=1)
+        with pytest.warns(UserWarning, match="did not converge in `max_iterations=1`"):
+            stopped = shapes.procrustes_align(copies, max_iterations=1)
         assert not stopped.converged and stopped.num_iterations == 1
 
     def test_errors(self, rng):
@@ -187,11 +189,146 @@ class TestProcrustes:
             shapes.procrustes_align(holed)
         holed = copies.copy()
         holed[:, 0] = np.nan
-        with pytest.raises(ValueError, match="one without missing points, or give a `reference`"):
+        with pytest.raises(ValueError, match=r"each point in one shape.*; \[0\] are missing"):
             shapes.procrustes_align(holed)
         assert shapes.procrustes_align(holed, copies[0]).converged
         with pytest.raises(ValueError, match="infinite"):
             shapes.procrustes_align(np.where(copies == copies[0, 0, 0], np.inf, copies))
+
+
+class TestMirrorImages:
+    """Referee: which shapes the test has mirrored."""
+
+    @pytest.mark.parametrize("dim", [2, 3])
+    @pytest.mark.parametrize("few", [[2], [1, 4, 7], [0], [0, 3, 5, 9]])
+    def test_the_minority_is_named(self, rng, dim, few):
+        _, copies = scatter(rng, num_shapes=12, dim=dim, noise=0.05)
+        right = shapes.procrustes_align(copies)
+        assert not right.mirrored.any() and not right.outliers.any()
+        turned = copies.copy()
+        turned[few, :, dim - 1] *= -1.0
+        specimens = [io.Specimen(shape, id=f"w{i}") for i, shape in enumerate(turned)]
+        listed = ", ".join(rf"`shapes\[{i}\]` \('w{i}'\)" for i in few)
+        with pytest.warns(UserWarning, match=f"fits far better: {listed}. .*`reflect=\"auto\"`"):
+            left = shapes.procrustes_align(specimens)
+        assert np.flatnonzero(left.mirrored).tolist() == few
+        mended = shapes.procrustes_align(specimens, reflect="auto")  # without a word
+        assert np.flatnonzero(mended.mirrored).tolist() == few
+        np.testing.assert_allclose(mended.distances, right.distances, atol=1e-9)
+        assert mended.num_iterations == right.num_iterations
+        assert mended.names == tuple(f"w{i}" for i in range(12))
+
+    def test_missing_points_and_sizes(self, rng):
+        _, copies = scatter(rng, num_shapes=9, dim=3, noise=0.05)
+        copies[4] *= [1.0, -1.0, 1.0]
+        copies[[1, 4, 5], [0, 3, 8]] = np.nan
+        mended = shapes.procrustes_align(copies, scale=False, reflect="auto")
+        assert np.flatnonzero(mended.mirrored).tolist() == [4]
+        np.testing.assert_array_equal(np.isnan(mended.shapes), np.isnan(copies))
+        copies[4] *= [1.0, -1.0, 1.0]
+        right = shapes.procrustes_align(copies, scale=False)
+        np.testing.assert_allclose(mended.distances, right.distances, atol=1e-8)
+
+    @pytest.mark.parametrize("halves", [slice(0, 4), slice(4, 8)])
+    def test_of_two_halves_the_first_is_right(self, rng, halves):
+        _, copies = scatter(rng, num_shapes=8, noise=0.05)
+        copies[halves] *= [1.0, -1.0]
+        found = shapes.procrustes_align(copies, reflect="auto")
+        assert np.flatnonzero(found.mirrored).tolist() == [4, 5, 6, 7]
+        np.testing.assert_allclose(found.shapes[0], shapes.unit_size(copies[0]), atol=1e-12)
+
+    def test_no_false_alarms(self, rng):
+        """Of shapes that are nearly their own mirror images, flat in space, or mere noise."""
+        noise = rng.normal(size=(20, 12, 3))
+        line = rng.normal(size=(1, 12, 2)) * [1.0, 0.0] + 1e-3 * noise[..., :2]
+        flat = (rng.normal(size=(1, 12, 3)) + 0.1 * noise) * [1.0, 1.0, 0.0]
+        for some in (line, flat, flat + 1e-3 * noise, noise, noise[..., :2]):
+            assert not shapes.procrustes_align(some, max_iterations=1000).mirrored.any()
+
+    def test_bends_to_both_sides_are_no_mirror_images(self, rng):
+        """Nearer to the mirror image, as many are; and a strong bend, not much nearer to it."""
+        s = np.linspace(-1.0, 1.0, 12)
+
+        def bent(by):
+            return np.stack([np.broadcast_to(s, (len(by), 12)), np.outer(by, s**2)], axis=-1)
+
+        assert not shapes.procrustes_align(bent(0.02 + 0.1 * rng.normal(size=40))).mirrored.any()
+        found = shapes.procrustes_align(bent(np.r_[0.05 + 0.01 * rng.normal(size=20), -0.4]))
+        assert not found.mirrored.any() and np.flatnonzero(found.outliers).tolist() == [20]
+
+    def test_a_long_list_is_cut_short(self, rng):
+        _, copies = scatter(rng, num_shapes=30, noise=0.02)
+        copies[15:27] *= [1.0, -1.0]
+        with pytest.warns(UserWarning, match=r"`shapes\[22\]` and 4 more. Seen"):
+            shapes.procrustes_align(copies)
+
+
+class TestDistances:
+    def test_are_what_they_say(self, rng):
+        _, copies = scatter(rng, noise=0.1)
+        copies[2, 3] = np.nan
+        for scale in (True, False):
+            found = shapes.procrustes_align(copies, scale=scale)
+            rms = [
+                np.sqrt(np.mean([np.sum((p - q) ** 2) for p, q in pairs if np.isfinite(p).all()]))
+                for pairs in (zip(shape, found.mean, strict=True) for shape in found.shapes)
+            ]
+            np.testing.assert_allclose(found.distances, rms / shapes.rms_radius(found.mean))
+
+    def test_outliers(self, rng):
+        _, copies = scatter(rng, num_shapes=40, noise=0.02)
+        assert not shapes.procrustes_align(copies).outliers.any()
+        copies[7, [2, 5]] = copies[7, [5, 2]]  # two landmarks in the wrong order
+        found = shapes.procrustes_align(copies)
+        assert np.flatnonzero(found.outliers).tolist() == [7] == [int(found.distances.argmax())]
+        assert not found.mirrored.any()
+        assert not shapes.procrustes_align(copies[5:9]).outliers.any()  # of four who is to say
+
+    def test_unpacks_as_ever(self, rng):
+        _, copies = scatter(rng)
+        found = shapes.procrustes_align(copies)
+        aligned, mean, num_iterations, converged = found
+        assert aligned is found.shapes and mean is found.mean
+        assert (num_iterations, converged) == (found.num_iterations, True)
+        assert found.names == (None,) * 6
+
+
+class TestNoCompleteShape:
+    def test_begins_from_the_least_incomplete(self, rng):
+        """Exact copies: the mean is that of complete ones."""
+        _, copies = scatter(rng, noise=0.0)
+        complete = shapes.procrustes_align(copies)
+        missing = np.zeros(copies.shape[:2], bool)
+        missing[np.arange(6), np.arange(6)] = True
+        missing[[0, 0, 3], [3, 4, 8]] = True
+        found = shapes.procrustes_align(np.where(missing[..., None], np.nan, copies))
+        assert found.converged
+        onto = shapes.procrustes_align(found.mean[None], complete.mean).shapes[0]
+        np.testing.assert_allclose(onto, complete.mean, atol=1e-8)
+        seen = np.where(missing[1][:, None], np.nan, shapes.unit_size(copies[1]))
+        np.testing.assert_allclose(found.shapes[1], seen, atol=1e-8)  # the first with one missing
+
+    def test_several_fill_up_the_first(self, rng):
+        _, copies = scatter(rng, num_shapes=3, dim=3, noise=0.0)
+        holed = copies.copy()
+        for shape, gone in zip(holed, ([0, 1], [1, 2], [0, 2]), strict=True):
+            shape[gone] = np.nan
+        found = shapes.procrustes_align(holed)
+        np.testing.assert_allclose(found.mean, shapes.procrustes_align(copies).mean, atol=1e-8)
+
+    def test_says_when_it_cannot(self, rng):
+        _, copies = scatter(rng, num_shapes=2, num_points=6)
+        copies[0, :3] = np.nan
+        copies[1, 3:] = np.nan
+        with pytest.raises(ValueError, match="no two have enough points in common .*`reference`"):
+            shapes.procrustes_align(copies)
+
+    def test_names_the_specimen(self):
+        few = io.Specimen([[1.0, 2.0], [np.nan, 3.0], [np.nan, 1.0]], id="crushed")
+        with pytest.raises(ValueError, match=r"`shapes\[1\]` \('crushed'\) must have at least 2"):
+            shapes.procrustes_align([io.Specimen(np.eye(3)[:, :2], id="whole"), few])
+        with pytest.raises(ValueError, match=r"`specimens\[1\]` \('crushed'\) has 3 landmarks"):
+            shapes.procrustes_align([io.Specimen(np.eye(2), id="whole"), few])
 
 
 def test_mean_shape(rng):
@@ -229,3 +366,20 @@ def test_rats_turn_back_from_their_registration(shared_data):
     alignment = shapes.procrustes_align(rats, scale=False)
     assert alignment.converged and alignment.shapes.std(axis=0).min() > 0.0
     np.testing.assert_allclose(shapes.rms_radius(alignment.shapes), shapes.rms_radius(rats))
+
+
+def test_real_shapes_raise_no_alarm(shared_data):
+    """In space too, with large differences between species; one of 911 that is mirrored is found."""
+    with np.load(shared_data / "steinmanella" / "steinmanella.npz") as data:
+        shells = data["shapes"]
+    with np.load(shared_data / "ptychomya" / "outlines.npz") as data:
+        outlines = data["outlines"]
+    wings = io.stack(io.read(shared_data / "morpho" / "hindwings.csv.gz")).shapes
+    tails = io.read(shared_data / "tyrannus" / "tyrannus.tps")
+    butterflies = io.read(shared_data / "papilio" / "papilio_raw_10.tps")
+    for some in (shells, outlines, wings, tails, butterflies):
+        found = shapes.procrustes_align(some)
+        assert found.converged and not found.mirrored.any() and not found.outliers.any()
+    wings[500] *= [1.0, -1.0]
+    with pytest.warns(UserWarning, match=r"far better: `shapes\[500\]`\."):
+        assert shapes.procrustes_align(wings).outliers[500]

@@ -24,64 +24,89 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._checks import flag
-from ._specimen import Specimen, as_specimens, fail, number, open_text, read_text, text
+from ._specimen import (
+    NOT_AVAILABLE,
+    Specimen,
+    as_specimens,
+    fail,
+    number,
+    open_text,
+    read_lines,
+    text,
+    warn_of_codes,
+)
 
 _BLOCKS = {"LM": 2, "LM3": 3}
 _FIELDS = {"IMAGE": "image", "ID": "id", "SCALE": "scale"}
-_RESERVED = {*_BLOCKS, *_FIELDS, "CURVES", "POINTS"}
+_LINES = ("CURVES", "OUTLINES")
+_RESERVED = {*_BLOCKS, *_FIELDS, *_LINES, "POINTS"}
 
 
-def read_tps(path: str | PathLike, *, negative_is_missing: bool = False, encoding: str = "utf-8") -> list[Specimen]:
+def read_tps(
+    path: str | PathLike, *, negative_is_missing: bool = False, encoding: str = "utf-8"
+) -> list[Specimen]:
     """Specimens of a tps file, in its order.
 
-    Keys may be in any case; blank lines and blanks at the end of a line do not matter. Keys other than LM,
-    LM3, CURVES, POINTS, IMAGE, ID and SCALE (COMMENT, VARIABLES, ...) are kept in `Specimen.notes`, one that
-    comes twice with its texts on two lines; those that carry rows of numbers (OUTLINES, RADII) are refused.
-    SCALE is reported, not applied.
+    Keys may be in any case; blank lines and blanks at the end of a line do not matter, nor do lines
+    of comment: those before the first LM=, and those that begin with #. OUTLINES are curves, after
+    those of CURVES. Keys other than LM, LM3, CURVES, OUTLINES, POINTS, IMAGE, ID and SCALE
+    (COMMENT, VARIABLES, ...) are kept in `Specimen.notes`, one that comes twice with its texts on
+    two lines; those that carry rows of numbers (RADII) are refused. SCALE is reported, not applied;
+    one that is empty or NA is none.
 
     **Arguments:**
 
     - `path`: the file; a name that ends in `.gz` is decompressed.
-    - `negative_is_missing`: tokens `NA` and `NaN` always are missing values and become NaN. tpsDig instead
-      marks a missing landmark with negative coordinates. As aligned data are negative too, that is only read
-      so if asked for: then a landmark with a negative coordinate becomes NaN in all its coordinates. Curves
-      are left alone.
+    - `negative_is_missing`: tokens `NA` and `NaN` always are missing values and become NaN. tpsDig
+      instead marks a missing landmark with negative coordinates. As aligned data are negative too,
+      that is only read so if asked for: then a landmark with a negative coordinate becomes NaN in
+      all its coordinates. Curves are left alone. A `UserWarning` tells of landmarks that look like
+      such marks and are not read so.
     - `encoding`: of the text.
 
     **Returns:** a list of `Specimen`.
 
-    **Raises:** `ValueError` with file, line number, what was expected and what was found, for anything else.
+    **Raises:** `ValueError` with file, line number, what was expected and what was found, for
+    anything else.
     """
     negative_is_missing = flag(negative_is_missing, "negative_is_missing")
-    lines = _Lines(path, read_text(path, encoding))
+    lines = _Lines(path, read_lines(path, encoding))
     if lines.current is None:
         fail(path, 1, "LM= or LM3=", "an empty file", "Export the file again.")
     specimens = []
     while lines.current is not None:
         specimens.append(_specimen(lines, negative_is_missing))
+    warn_of_codes(path, specimens, "Pass `negative_is_missing=True` if so.")
     return specimens
 
 
-def write_tps(path: str | PathLike, specimens: Iterable[Specimen], *, encoding: str = "utf-8") -> None:
+def write_tps(
+    path: str | PathLike, specimens: Iterable[Specimen], *, encoding: str = "utf-8"
+) -> None:
     """Write specimens so that `read_tps` returns the same ones, to the last digit.
 
     Missing values are written as NA. A name that ends in `.gz` is compressed.
 
-    **Raises:** `ValueError` where a text would not read back: line breaks (except in notes), blanks at its
-    ends, a note whose key has a meaning in the format.
+    **Raises:** `ValueError` where a text would not read back: line breaks (except in notes), blanks
+    at its ends, a note whose key has a meaning in the format.
     """
     lines = [line for specimen in as_specimens(specimens) for line in _format(specimen)]
-    with open_text(path, "w", encoding, newline="\n") as file:
+    with open_text(path, encoding) as file:
         file.write("\n".join(lines) + "\n")
 
 
 class _Lines:
-    """The lines with content: `current` is the next one, `None` at the end, and `number` its number."""
+    """The lines with content: `current` is the next one, `None` at the end, and `number` its
+    number."""
 
-    def __init__(self, path: str | PathLike, content: str):
+    def __init__(self, path: str | PathLike, every: list[str]):
         self.path = path
-        every = content.split("\n")
-        self._rest = ((i, line.strip()) for i, line in enumerate(every, start=1) if line.strip())
+        keys = [_key(line) for line in every]
+        first = next((i for i, key in enumerate(keys) if key in _BLOCKS), 0)
+        if any(key in _RESERVED or _is_row(every[i]) for i, key in enumerate(keys[:first])):
+            first = 0  # more than a comment: the first specimen says what is wrong
+        numbered = enumerate(every[first:], start=first + 1)
+        self._rest = ((i, line) for i, line in numbered if line and not _is_comment(line))
         self._num_lines = len(every)
         self.advance()
 
@@ -92,51 +117,85 @@ class _Lines:
         """(KEY, value) of a line KEY=value; `None` for any other."""
         if self.current is None or "=" not in self.current:
             return None
-        key, _, value = self.current.partition("=")
-        return key.strip().upper(), value.strip()
+        return _key(self.current), self.current.partition("=")[2].strip()
 
     def fail(self, expected: str, cure: str) -> NoReturn:
         found = "the end of the file" if self.current is None else repr(self.current)
         fail(self.path, self.number, expected, found, cure)
 
 
+def _key(line: str) -> str:
+    """What stands before the first =, in upper case."""
+    key, equals, _ = line.partition("=")
+    return key.strip().upper() if equals else ""
+
+
+def _is_comment(line: str) -> bool:
+    return line.startswith("#") and "=" not in line
+
+
+def _is_row(line: str) -> bool:
+    """Whether a line holds numbers only, as those of points do."""
+    return re.fullmatch(r"[\s\d.,+-]*\d[\s\d.,+-]*", line) is not None
+
+
 def _specimen(lines: _Lines, negative_is_missing: bool) -> Specimen:
     key, _ = lines.key() or ("", "")
     if key not in _BLOCKS:
-        cure = "A specimen begins with LM=; numbers follow LM=, LM3= or POINTS= only, as many as these say."
+        cure = (
+            "A specimen begins with LM=: delete what stands before the first one; numbers follow "
+            "LM=, LM3= or POINTS= only, as many as these say."
+        )
         lines.fail("LM= or LM3=", cure)
     dim, began = _BLOCKS[key], lines.number
     landmarks = _rows(lines, key, _count(lines), dim)
     if negative_is_missing:
         landmarks[(landmarks < 0.0).any(axis=1)] = np.nan
 
-    curves: tuple[NDArray, ...] | None = None
+    curves: dict[str, list[NDArray]] = {}
     fields: dict = {}
     notes: dict[str, str] = {}
     while (entry := lines.key()) is not None and entry[0] not in _BLOCKS:
         key, value = entry
-        if key in _FIELDS and key in fields or key == "CURVES" and curves is not None:
-            lines.fail(f"{key}= once for the specimen from line {began}", "Delete one of the two lines.")
-        if key == "CURVES":
-            curves = tuple(_curves(lines, dim))
+        if key in fields or key in curves:
+            lines.fail(
+                f"{key}= once for the specimen from line {began}", "Delete one of the two lines."
+            )
+        if key in _LINES:
+            curves[key] = list(_curves(lines, key, dim))
             continue
         if key == "POINTS":
-            lines.fail("CURVES= before POINTS=", "CURVES= gives the number of POINTS= blocks: correct it.")
+            lines.fail(
+                "CURVES= before POINTS=", "CURVES= gives the number of POINTS= blocks: correct it."
+            )
         if key == "SCALE":
-            fields[key] = number(value, lines.path, lines.number, missing=())
+            fields[key] = _scale(lines, value)
         elif key in _FIELDS:
             fields[key] = value
         else:
             notes[key] = f"{notes[key]}\n{value}" if key in notes else value
         lines.advance()
     named = {_FIELDS[key]: value for key, value in fields.items()}
-    return Specimen(landmarks, curves or (), notes=notes, **named)
+    every = [curve for key in _LINES for curve in curves.get(key, ())]
+    return Specimen(landmarks, tuple(every), notes=notes, **named)
+
+
+def _scale(lines: _Lines, value: str) -> float | None:
+    """A positive number, or none where the line says nothing."""
+    if value.lower() in NOT_AVAILABLE:
+        return None
+    scale = number(value, lines.path, lines.number, missing=())
+    if not scale > 0:
+        lines.fail("a positive number after SCALE=", "Correct it, or delete the line.")
+    return scale
 
 
 def _count(lines: _Lines) -> int:
     key, value = lines.key() or ("", "")
     if not value.isdecimal():
-        lines.fail(f"a whole number after {key}=", "Write the number of rows or blocks that follow.")
+        lines.fail(
+            f"a whole number after {key}=", "Write the number of rows or blocks that follow."
+        )
     lines.advance()
     return int(value)
 
@@ -157,11 +216,11 @@ def _rows(lines: _Lines, key: str, count: int, dim: int) -> NDArray:
     return rows
 
 
-def _curves(lines: _Lines, dim: int) -> Iterator[NDArray]:
+def _curves(lines: _Lines, key: str, dim: int) -> Iterator[NDArray]:
     count = _count(lines)
     for j in range(count):
         if (lines.key() or ("", ""))[0] != "POINTS":
-            lines.fail(f"POINTS= of curve {j + 1} of {count}", "Add the curve, or correct CURVES=.")
+            lines.fail(f"POINTS= of curve {j + 1} of {count}", f"Add the curve, or correct {key}=.")
         yield _rows(lines, "POINTS", _count(lines), dim)
 
 
@@ -181,9 +240,14 @@ def _format(specimen: Specimen) -> Iterator[str]:
     if specimen.scale is not None:
         yield f"SCALE={float(specimen.scale)!r}"
     for key, value in specimen.notes.items():
-        if not re.fullmatch(r"[^\s=]([^\n\r=]*[^\s=])?", key) or key != key.upper() or key in _RESERVED:
+        if (
+            not re.fullmatch(r"[^\s=]([^\n\r=]*[^\s=])?", key)
+            or key != key.upper()
+            or key in _RESERVED
+        ):
             raise ValueError(
-                f"`notes` has the key {key!r}: use upper case, and no key that has a meaning in the format."
+                f"`notes` has the key {key!r}: use upper case, and no key that has a meaning in "
+                "the format."
             )
         for line in value.split("\n"):
             yield f"{key}={_one_line(line, 'notes')}"

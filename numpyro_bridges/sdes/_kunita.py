@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._checks import as_float, concrete, flag, require, require_instance
+from .._checks import as_float, concrete, flag, require, require_instance, words
 from .._types import RealScalar, State, Structured
 from ..kernels import AbstractKernel
 from ..spaces import AbstractSpace, Landmarks
@@ -169,6 +169,25 @@ class KunitaFlow(AbstractSDE):
         if large:
             warnings.warn(f"the noise is wrong by more than 1 % of a(x, x): {', '.join(large)}.", stacklevel=2)
         return error
+
+    def point_sd(self, t: RealScalar = 1.0) -> Float[Array, ""]:
+        """The standard deviation of a coordinate of a point after a time t: √(t a(x, x)).
+
+        It is what an amplitude means, in the units of the shapes: for the Gaussian kernel in the
+        plane √(π t) αℓ. It is exact at every t, as a point that the flow carries is a martingale
+        whose noise has the covariance a(x, x) wherever it is. What spectral or grid noise leaves out
+        of a(x, x), `noise_error` says; a point of a curve in a `FourierBasis` moves less, by what the
+        basis leaves out of the noise.
+
+        **Arguments:** `t`: from 0 on.
+        """
+        t = as_float(t, "t")
+        known = concrete(t)
+        require(
+            t.ndim == 0 and (known is None or known >= 0),
+            f"`t` must be a number from 0 on; got {words(t)}. Use vmap for several.",
+        )
+        return jnp.sqrt(t * self.covariance_kernel.variance.astype(t.dtype))
 
     def carry(
         self, path: Float[Array, "K+1 n dim"], points: Float[Array, "q dim"], *, inverse: bool = False

@@ -1,0 +1,106 @@
+"""The NTS format of NTSYSpc (F. J. Rohlf), also `.dta` of Landmark Editor: a matrix of numbers.
+
+```text
+"a comment
+1 2L 4 1 -999 DIM=2        a rectangle of 2 rows, which have labels, and 4 columns; -999 is missing
+first second               the labels
+1 2 3 4                    the rows: points one after another
+5 6 -999 -999
+```
+"""
+
+import re
+from collections.abc import Iterator
+from os import PathLike
+
+import numpy as np
+
+from ._specimen import Specimen, fail, missing_codes, number, read_lines, stem
+
+_HEADER = re.compile(
+    r"1\s+(?P<rows>\d+)(?P<row_labels>[LBE]?)\s+(?P<columns>\d+)(?P<column_labels>L?)"
+    r"(\s+(?P<has_missing>\d+)(\s+(?P<code>[^\s=]+))?)?(\s+DIM=(?P<dim>[23]))?",
+    re.IGNORECASE,
+)
+
+
+def read_nts(path: str | PathLike, *, encoding: str = "utf-8") -> list[Specimen]:
+    """Specimens of an NTS file, one a row; or the one specimen of a file whose rows are points.
+
+    Rows are points where there are as many columns as dimensions; the specimen then has the name of
+    the file. The labels of rows are the names of specimens, or those of points, in
+    `Specimen.notes["labels"]`, one a line. Missing are the code that the file names, and NA.
+
+    **Arguments:**
+
+    - `path`: the file; one that gzip compressed is decompressed.
+    - `encoding`: of the text, unless the file has a byte order mark, which says it.
+
+    **Returns:** a list of `Specimen`.
+
+    **Raises:** `ValueError` with file, line number, what was expected and what was found, for
+    anything else.
+    """
+    lines = read_lines(path, encoding)
+    content = [(i, line) for i, line in enumerate(lines, start=1) if line and line[0] not in "\"'"]
+    if not content:
+        fail(path, 1, "a line such as 1 10L 20 0 DIM=2", "an empty file", "Export the file again.")
+    began, first = content[0]
+    header = _HEADER.fullmatch(re.sub(r"\s*=\s*", "=", first))
+    if header is None:
+        cure = "It says: 1, the rows, the columns, whether some are missing and their code, DIM=."
+        fail(path, began, "a line such as 1 10L 20 0 DIM=2", repr(first), cure)
+    num_rows, num_columns = int(header["rows"]), int(header["columns"])
+    dim = int(header["dim"] or num_columns)
+    if dim not in (2, 3) or num_columns == 0 or num_columns % dim:
+        cure = "Write DIM=2 or DIM=3 at the end of the line."
+        fail(path, began, "DIM=, which divides the columns", repr(first), cure)
+    has_missing = int(header["has_missing"] or 0) > 0
+    codes = missing_codes(header["code"] if has_missing and header["code"] else ())
+    tokens = _Tokens(path, content[1:], len(lines))
+    where = header["row_labels"].upper()
+    labels = tokens.take(num_rows) if where == "L" else []
+    tokens.take(num_columns if header["column_labels"] else 0)
+    rows = []
+    for _ in range(num_rows):
+        labels += tokens.take(1 if where == "B" else 0)
+        rows.append([number(token, path, tokens.line, codes) for token in tokens.take(num_columns)])
+        labels += tokens.take(1 if where == "E" else 0)
+    tokens.end()
+    shapes = np.reshape(rows, (-1, num_columns // dim, dim))
+    if num_columns == dim:
+        notes = {"labels": "\n".join(labels)} if labels else {}
+        return [Specimen(shapes[:, 0], id=stem(path), notes=notes)]
+    return [
+        Specimen(shape, id=name)
+        for shape, name in zip(shapes, labels or [None] * num_rows, strict=True)
+    ]
+
+
+class _Tokens:
+    """The words of a file, and the line that the last of them was on."""
+
+    def __init__(self, path: str | PathLike, content: list[tuple[int, str]], num_lines: int):
+        self.path, self.num_lines = path, num_lines
+        self.line = num_lines
+        self._rest: Iterator = ((i, word) for i, line in content for word in line.split())
+
+    def take(self, count: int) -> list[str]:
+        taken = []
+        for _ in range(count):
+            self.line, word = next(self._rest, (self.num_lines, None))
+            if word is None:
+                cure = "The file is cut short, or its first line says too much."
+                fail(self.path, self.line, "more numbers or labels", "the end of the file", cure)
+            taken.append(word)
+        return taken
+
+    def end(self) -> None:
+        for line, word in self._rest:
+            fail(
+                self.path,
+                line,
+                "the end of the file",
+                repr(word),
+                "The first line says too little.",
+            )
