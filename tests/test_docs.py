@@ -34,8 +34,12 @@ for path, found in blocks[int(first) :: int(count)]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
-    [["extending.md"], ["guides.md", "scores.md", "trees.md", "troubleshooting.md"]],
-    ids=["extending", "others"],
+    [
+        ["extending.md"],
+        ["guides.md", "scores.md", "trees.md", "troubleshooting.md"],
+        ["hierarchical.md", "observation_sd.md", "long_runs.md"],
+    ],
+    ids=["extending", "others", "models"],
 )
 def test_code_runs_as_it_stands(names, tmp_path):
     """Every block by itself, in single precision as a user's process has it; an error names the line of the page.
