@@ -5,9 +5,11 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import numpyro_bridges as nb
 
@@ -97,6 +99,31 @@ def test_citations_exist(path):
 def test_every_entry_is_cited():
     text = "".join(path.read_text(encoding="utf-8") for path in [*PAGES, *SOURCES])
     assert [key for key in ENTRIES if f"[@{key}]" not in text] == []
+
+
+def test_versions_agree():
+    """What is said of the version and of dependencies in more than one place is the same."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    recipe = (ROOT / ".ci" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.search(r"^version: (\S+)$", citation, re.M).group(1) == project["version"]
+    assert re.search(r'^  version: "(\S+)"$', recipe, re.M).group(1) == project["version"]
+    assert f"## {project['version']}" in (ROOT / "docs" / "changelog.md").read_text(encoding="utf-8")
+    needed = {requirement.replace(" ", "") for requirement in project["dependencies"]}
+    run = recipe[recipe.index("  run:") : recipe.index("tests:")]
+    packaged = {line.replace(" ", "") for line in re.findall(r"^    - (.*)$", run, re.M) if "python" not in line}
+    assert packaged == needed
+
+
+def test_lowest_versions_are_the_bounds():
+    """The constraints with which CI runs once are those that `pyproject.toml` claims, or what others need."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / ".ci" / "lowest.txt").read_text(encoding="utf-8")
+    lowest = dict(re.findall(r"^(\S+)==(\S+)$", lines, re.M))
+    extras = project["optional-dependencies"]
+    for text in [*project["dependencies"], *extras["examples"], *extras["tests"][1:]]:
+        requirement = Requirement(text)
+        assert lowest[requirement.name] in requirement.specifier, text
 
 
 def test_top_level_names_have_docstrings():

@@ -132,5 +132,6 @@ def bibliography_page(bibliography: Path) -> str:
     blocks = ["# References"]
     for entry in Style().format_entries(list(entries.values())):
         label = authors_and_year(entries[entry.key])
-        blocks.append(f"[](){{#{entry.key}}}\n**{label}.** {entry.text.render_as('html')}")
+        text = re.sub("</?span.*?>", "", entry.text.render_as("html"))  # about letters in capitals
+        blocks.append(f"[](){{#{entry.key}}}\n**{label}.** {text}")
     return "\n\n".join(blocks)

@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._checks import as_float, concrete, exact_float, require, require_finite, require_instance, words
-from .._types import RealScalar, State
+from .._types import RealScalar
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractMatch
 from ..guiding import AbstractGuide
@@ -53,7 +54,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
     def __init__(
         self,
         sde: AbstractSDE,
-        x0: State,
+        x0: ArrayLike,
         match: AbstractMatch,
         *,
         t1: RealScalar | None = None,

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import ArrayLike
+from numpy.typing import ArrayLike
 
 from .._checks import (
     as_float,
@@ -28,7 +28,7 @@ from .._checks import (
     require_instance,
     words,
 )
-from .._types import RealScalar, State
+from .._types import RealScalar
 from ..conditioning import AbstractMatch, fused
 from ..guiding import AbstractGuide
 from ..sdes import AbstractSDE, as_covariance
@@ -100,7 +100,7 @@ class DiffusionTree(AbstractNoiseDriven):
     def __init__(
         self,
         sde: AbstractSDE,
-        x0: State,
+        x0: ArrayLike,
         match: AbstractMatch,
         *,
         tree: Tree,
