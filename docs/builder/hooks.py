@@ -147,7 +147,8 @@ def module_page(unit: str, module: ModuleType, top: dict[str, object]) -> str:
 
 def directive(name: str, level: int = 2) -> str:
     """What mkdocstrings replaces by the docstring of a name below `nb`."""
-    options = f"      heading: nb.{name}\n      toc_label: {name}\n      heading_level: {level}"
+    label = name.rpartition(".")[2]
+    options = f"      heading: nb.{name}\n      toc_label: {label}\n      heading_level: {level}"
     return f"::: {nb.__name__}.{name}\n    options:\n{options}"
 
 
