@@ -1,6 +1,7 @@
 """The documentation: its code runs, its citations exist, and what is exported is documented."""
 
 import inspect
+import json
 import os
 import re
 import subprocess
@@ -67,6 +68,23 @@ def test_code_runs_as_it_stands(names, tmp_path):
     assert [process.returncode for process in running] == [0, 0], "\n".join(printed)
     blocks = sum(page.read_text(encoding="utf-8").count("\n```python\n") for page in pages)
     assert blocks >= 3 and "".join(printed).count("ran the block") == blocks
+
+
+@pytest.mark.slow
+def test_code_has_the_right_types(tmp_path):
+    """What the pages pass is what the annotations take: pyright over every block, with the settings of the package."""
+    pytest.importorskip("pyright")
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for found in re.finditer(r"^```python\n(.*?)^```", text, re.S | re.M):
+            line = text[: found.start(1)].count("\n")
+            (tmp_path / f"{page.stem}_{line}.py").write_text(found.group(1), encoding="utf-8")
+    settings = {"extraPaths": [str(ROOT)], "typeCheckingMode": "basic", "pythonVersion": "3.11"}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
+    checker = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--project", str(tmp_path)]
+    quiet = {"PYRIGHT_PYTHON_IGNORE_WARNINGS": "1"}
+    done = subprocess.run(checker, env=os.environ | quiet, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def fields(body):
