@@ -57,6 +57,7 @@ def test_mathematics(rendered):
         (r"\psi", "mi", "ψ", {}),
         (r"f(-x)", "mo", "−", {"form": "prefix"}),
         (r"a - x", "mo", "−", {}),
+        (r"f(x) - 1", "mo", "−", {}),
     ],
 )
 def test_settings_of_mathematics(tex, tag, text, attributes, builder):
