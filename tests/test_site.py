@@ -1,4 +1,7 @@
-"""What the documentation's builder makes of mathematics, citations, scripts and docstrings; `mkdocs build` is CI's."""
+"""What the builder of the documentation makes of formulas, citations, scripts and docstrings.
+
+CI builds the whole.
+"""
 
 import importlib
 import re
@@ -39,7 +42,9 @@ def formula(page):
 
 
 def test_mathematics(rendered):
-    page = rendered("The law is $x' \\sim N(0, \\Sigma)$, and\n\n$$ \\sum_{k<K} \\log\\frac{p_k}{q_k} . $$\n")
+    page = rendered(
+        "The law is $x' \\sim N(0, \\Sigma)$, and\n\n$$ \\sum_{k<K} \\log\\frac{p_k}{q_k} . $$\n"
+    )
     assert "$" not in page and "\\" not in page
     text = "".join(formula(page).itertext())
     assert text == "x′∼N(0,Σ)"
@@ -64,10 +69,14 @@ def test_settings_of_mathematics(tex, tag, text, attributes, builder):
     tree = ElementTree.fromstring(builder("extension").mathml(tex, "inline"))
     parts = [part for part in tree.iter(NAMESPACE + tag) if "".join(part.itertext()) == text]
     assert parts and all(attributes.items() <= part.attrib.items() for part in parts)
-    assert "form" in attributes or all(part.get("form") != "prefix" or tex.startswith(r"\left") for part in parts)
+    assert "form" in attributes or all(
+        part.get("form") != "prefix" or tex.startswith(r"\left") for part in parts
+    )
 
 
-@pytest.mark.parametrize("tex, spaces", [(r"\log x", 1), (r"2 \log x", 2), (r"2 + \log(x)", 0), (r"\exp", 0)])
+@pytest.mark.parametrize(
+    "tex, spaces", [(r"\log x", 1), (r"2 \log x", 2), (r"2 + \log(x)", 0), (r"\exp", 0)]
+)
 def test_spaces_of_functions(tex, spaces, builder):
     assert builder("extension").mathml(tex, "inline").count("<mspace") == spaces
 
@@ -91,11 +100,23 @@ def test_bibliography(builder):
 
 def test_every_public_name_has_a_place(builder):
     pages = dict(builder("hooks").reference_pages())
-    listed = [name for page in pages.values() for name in re.findall(r"^::: numpyro_bridges\.(\S+)$", page, re.M)]
+    listed = [
+        name
+        for page in pages.values()
+        for name in re.findall(r"^::: numpyro_bridges\.(\S+)$", page, re.M)
+    ]
     assert len(listed) == len(set(listed))
-    public = {name for name, value in vars(nb).items() if callable(value) and not name.startswith("_")}
+    public = {
+        name for name, value in vars(nb).items() if callable(value) and not name.startswith("_")
+    }
     assert public <= set(listed)
-    assert {"infer.PCN", "io.read_tps", "plot.tree", "weights.pareto_k", "guiding.AbstractPlan"} <= set(listed)
+    assert {
+        "infer.PCN",
+        "io.read_tps",
+        "plot.tree",
+        "weights.pareto_k",
+        "guiding.AbstractPlan",
+    } <= set(listed)
     assert "GuidedBridge" in pages["bridges"] and "compare" in pages["compare"]
 
 
@@ -104,11 +125,14 @@ def test_tutorial(builder, tmp_path, monkeypatch):
     monkeypatch.setattr(hooks, "FIGURES", tmp_path)
     (tmp_path / "there.png").write_bytes(b"")
     script = (
-        "# %% [markdown]\n# # Title\n#\n#     python script.py\n# ![a](there.png)\n# ![b](missing.png)\n\n"
+        "# %% [markdown]\n# # Title\n#\n#     python script.py\n# ![a](there.png)\n"
+        "# ![b](missing.png)\n\n"
         "# %%\nimport numpy  # noqa: E402\n\n\n# %%\n"
     )
     page = hooks.tutorial(script)
-    assert page == "# Title\n\n    python script.py\n![a](there.png)\n\n\n```python\nimport numpy\n```"
+    assert (
+        page == "# Title\n\n    python script.py\n![a](there.png)\n\n\n```python\nimport numpy\n```"
+    )
 
 
 def test_first_steps(builder):
@@ -134,12 +158,19 @@ def test_problems(page, words, builder):
     problems = builder("hooks").problems
     assert any(words in problem for problem in problems(page))
     assert list(problems(f"<code>{page}</code>")) == [] or words == "another host"
-    assert list(problems('<p>Fine.</p><script src="a.js"></script><a href="https://elsewhere.example">x</a>')) == []
+    assert (
+        list(
+            problems(
+                '<p>Fine.</p><script src="a.js"></script><a href="https://elsewhere.example">x</a>'
+            )
+        )
+        == []
+    )
 
 
 def test_font_has_the_characters_of_formulas(builder):
     font_tools = pytest.importorskip("fontTools.ttLib")
-    page = '<p>Ж</p><math><mi>x</mi><mo>&#x02211;</mo><mo>∼</mo></math>'
+    page = "<p>Ж</p><math><mi>x</mi><mo>&#x02211;</mo><mo>∼</mo></math>"
     font = font_tools.TTFont(BytesIO(builder("fonts").mathematical_font(page)))
     characters = set(font.getBestCmap())
     assert {ord("∑"), ord("∼"), 0x1D465} <= characters and ord("Ж") not in characters

@@ -1,10 +1,11 @@
-"""Looks at the site that was built in a browser: what a reader meets, and what only a browser shows.
+"""Looks at the site that was built in a browser: what a reader meets.
 
     pip install playwright && apt-get install chromium
     python docs/builder/browse.py --screenshots shots
 
-Serves `site/` on this machine and opens every page. Wrong are: a request that fails or goes to another host, an
-error of a script, TeX or a citation that is left, a page that is wider than a phone, a search without a result.
+Serves `site/` on this machine and opens every page. Wrong are: a request that fails or goes to
+another host, an error of a script, TeX or a citation that is left, a page that is wider than a
+phone, a search without a result.
 """
 
 import argparse
@@ -81,7 +82,9 @@ def visit_all(browser: Browser, home: str, paths: list[str]) -> list[str]:
     for path in paths:
         page.goto(home + path, wait_until="networkidle")
         text = page.evaluate("document.querySelector('article')?.innerText ?? ''")
-        code = page.evaluate("[...document.querySelectorAll('article code')].map(c => c.innerText).join('\\n')")
+        code = page.evaluate(
+            "[...document.querySelectorAll('article code')].map(c => c.innerText).join('\\n')"
+        )
         for raw in re.findall(r"\[@\w+\]|\\[()\[\]A-Za-z]\S*|\$\$", text):
             if raw not in code:
                 found.append(f"/{path}: {raw}")
@@ -122,7 +125,9 @@ def look(browser: Browser, home: str, folder: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--site", type=Path, default=ROOT / "site")
     parser.add_argument("--chromium", default=shutil.which("chromium"), help="the program")
     parser.add_argument("--screenshots", type=Path, help="a folder for pictures of a few pages")
@@ -132,7 +137,9 @@ def main() -> None:
     paths = sorted(str(file.parent.relative_to(site)) + "/" for file in site.rglob("index.html"))
     paths = ["" if path == "./" else path for path in paths]
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=arguments.chromium, args=["--no-sandbox"])
+        browser = playwright.chromium.launch(
+            executable_path=arguments.chromium, args=["--no-sandbox"]
+        )
         found = visit_all(browser, home, paths) + search_all(browser, home)
         if arguments.screenshots:
             look(browser, home, arguments.screenshots)

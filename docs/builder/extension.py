@@ -1,4 +1,4 @@
-"""Two habits of our pages that Markdown does not know: mathematics as MathML, and citations as links.
+"""What our pages have and Markdown does not know: mathematics as MathML, citations as links.
 
 Browsers draw MathML by themselves, so a page needs neither a script nor a network.
 """
@@ -32,7 +32,8 @@ class Mathematics(Postprocessor):
     r"""What arithmatex has marked, `\(...\)` in a line and `\[...\]` as a block, converted."""
 
     MARKED = re.compile(
-        r'<(?:span|div) class="arithmatex">\s*\\(?P<kind>[(\[])(?P<tex>.*?)\\[)\]]\s*</(?:span|div)>',
+        r'<(?:span|div) class="arithmatex">\s*'
+        r"\\(?P<kind>[(\[])(?P<tex>.*?)\\[)\]]\s*</(?:span|div)>",
         re.S,
     )
 
@@ -67,11 +68,15 @@ def mathml(tex: str, display: str) -> str:
 
 
 def space(row: Element) -> None:
-    """Thin spaces beside the name of a function, as in 2 log x but not in log(x); none after the sign of a number."""
-    children = list(row)
+    """Thin spaces beside the name of a function, as in 2 log x but not in log(x).
+
+    None follows the sign of a number, -1, as one follows that of a difference.
+    """
+    children = [None, *row, None]
     row[:] = []
-    for before, child, after in zip([None, *children], children, [*children[1:], None], strict=False):
-        if child.text in SIGNS and (before is None or before.tag == "mo" and before.text not in CLOSING):
+    for before, child, after in zip(children, children[1:-1], children[2:], strict=False):
+        nothing = before is None or before.tag == "mo" and before.text not in CLOSING
+        if child.text in SIGNS and nothing:
             child.set("form", "prefix")
         is_function = child.text in FUNCTIONS
         if is_function and before is not None and before.tag not in ("mo", "mspace"):
@@ -116,7 +121,7 @@ def entries_of(bibliography: Path) -> dict[str, Entry]:
 
 
 def authors_and_year(entry: Entry) -> str:
-    """"Bell 1994", "Mider and Schauer 2021", "Baker et al. 2024"."""
+    """Such as Bell 1994, Durham and Gallant 2002, or Baker et al. 2024."""
     surnames = []
     for person in entry.persons["author"]:
         parts = [*person.rich_prelast_names, *person.rich_last_names]

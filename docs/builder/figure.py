@@ -1,4 +1,4 @@
-"""The figure of the landing page: a bridge from one mosquito wing to another, drawn at true scale."""
+"""The figure of the landing page: a bridge from one wing to another, at true scale."""
 
 import io
 
@@ -13,7 +13,7 @@ START, END = "PS 41", "AE 61"  # those of the set that differ most
 
 
 def wing_bridge() -> str:
-    """An SVG: outlines of one path from a wing of *Psorophora* to one of *Aedes*, and the way of each point."""
+    """An SVG: outlines of one path from a *Psorophora* to an *Aedes*, and the way of each point."""
     wings = nb.datasets.mosquito_wings(NUM_POINTS)
     start, end = (wings.points[wings.names.index(name)] for name in (START, END))
     flow = nb.KunitaFlow(nb.Landmarks(NUM_POINTS, 2), nb.GaussianKernel(0.05, 0.4))

@@ -1,4 +1,4 @@
-"""The font of the formulas: without one, browsers of some systems draw brackets and sums too small."""
+"""The font of the formulas: browsers without one draw brackets and sums too small."""
 
 import html
 import io
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fontTools import subset
 
-# The font that ziamath draws with, under the SIL Open Font License; nothing else of the package is used.
+# The font that ziamath draws with (SIL Open Font License); nothing else of the package is used.
 SOURCE = Path(str(distribution("ziamath").locate_file("ziamath/fonts/STIXTwoMath-Regular.ttf")))
 
 # Browsers draw a letter that stands for a variable from these slanted alphabets.

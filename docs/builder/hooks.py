@@ -1,7 +1,8 @@
-"""Pages that are made while the site is built, and a check of what was built; MkDocs calls the functions `on_*`.
+"""Pages that are made while the site is built, and a check of what was built.
 
-Made are the reference (a page for each sub-package, from the docstrings), the bibliography, the tutorials (from the
-percent scripts of `examples/`), the first steps (from the README), and the figure of the landing page.
+MkDocs calls the functions `on_*`. Made are the reference (a page for each sub-package, from the
+docstrings), the bibliography, the tutorials (from the percent scripts of `examples/`), the first
+steps (from the README), and the figure of the landing page.
 """
 
 import html
@@ -48,15 +49,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made |= {f"api/{name}.md": text for name, text in reference_pages()}
     for script in sorted((ROOT / "examples").glob("*.py")):
         made[f"tutorials/{script.stem}.md"] = tutorial(script.read_text(encoding="utf-8"))
+    pages = "".join(str(page) for page in made.values())
     for figure in FIGURES.glob("*.png"):
-        made[f"tutorials/{figure.name}"] = figure.read_bytes()
+        if f"({figure.name})" in pages:
+            made[f"tutorials/{figure.name}"] = figure.read_bytes()
     for path, content in made.items():
         files.append(File.generated(config, path, content=content))
     return files
 
 
 def on_post_build(config: MkDocsConfig) -> None:
-    """A warning, so an error of a strict build, for each page that shows its source or needs another host."""
+    """A warning, so an error of a strict build, for each page that is not as it should be."""
     site = Path(config.site_dir)
     pages = {path: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
     for path, text in pages.items():
@@ -67,7 +70,7 @@ def on_post_build(config: MkDocsConfig) -> None:
 
 
 def problems(page: str) -> Iterator[str]:
-    """What a reader would see of the source, outside code, and what a browser would fetch from elsewhere."""
+    """What is left of the source outside code, and what a browser would fetch from elsewhere."""
     prose = re.sub(r"<(code|pre|script|style)\b.*?</\1>", "", page, flags=re.S)
     prose = html.unescape(prose)
     for found in re.findall(r"\[@\w+\]", prose):
@@ -89,7 +92,8 @@ def first_steps(readme: str) -> str:
 def tutorial(script: str) -> str:
     """A percent script as a page: its Markdown cells as they are, the others as code.
 
-    An image that a Markdown cell shows, `![caption](name.png)`, is left out where the script has not been run.
+    An image that a Markdown cell shows, `![caption](name.png)`, is left out where the script has
+    not been run.
     """
     blocks = []
     for cell in re.split(r"^# %%", script, flags=re.M)[1:]:
@@ -108,11 +112,13 @@ def _image_if_there(found: re.Match) -> str:
 
 
 def reference_pages() -> Iterator[tuple[str, str]]:
-    """A page for each sub-package, and one on what only the top level has; the first lists all of that."""
+    """A page for each sub-package, one on what only the top level has, and a first that lists it."""
     top = {name: value for name, value in vars(nb).items() if ours(name, value)}
-    units = [info.name for info in pkgutil.iter_modules(nb.__path__) if not info.name.startswith("_")]
+    names = [info.name for info in pkgutil.iter_modules(nb.__path__)]
+    units = [name for name in names if not name.startswith("_")]
+    alone = [name for name, value in top.items() if unit_of(value) not in units]
     yield "index", overview(top)
-    yield "compare", "\n\n".join(["# Comparison of guides", *map(directive, only_at_top(top, units))])
+    yield "compare", "\n\n".join(["# Comparison of guides", *map(directive, alone)])
     for unit in units:
         module = importlib.import_module(f"{nb.__name__}.{unit}")
         yield unit, module_page(unit, module, top)
@@ -127,18 +133,15 @@ def unit_of(value: object) -> str:
     return str(value.__module__).split(".")[1]
 
 
-def only_at_top(top: dict[str, object], units: list[str]) -> list[str]:
-    return [name for name, value in top.items() if unit_of(value) not in units]
-
-
 def module_page(unit: str, module: ModuleType, top: dict[str, object]) -> str:
-    found = {name: value for name, value in vars(module).items() if ours(name, value) and unit_of(value) == unit}
+    public = {name: value for name, value in vars(module).items() if ours(name, value)}
+    found = {name: value for name, value in public.items() if unit_of(value) == unit}
     blocks = [f"# nb.{unit}", inspect.getdoc(module) or ""]
     blocks += [directive(name) for name, value in found.items() if top.get(name) is value]
     others = [f"{unit}.{name}" for name, value in found.items() if top.get(name) is not value]
     if unit in LAYERS and others:
-        blocks.append("## For classes of your own")
-        blocks.append("What other layers build on. [Writing your own](../extending.md) shows some of it in use.")
+        seen = "[Writing your own](../extending.md) shows it in use."
+        blocks += ["## For classes of your own", f"What other layers build on. {seen}"]
         blocks += [directive(name, level=3) for name in others]
     else:
         blocks += [directive(name) for name in others]
@@ -154,9 +157,13 @@ def directive(name: str, level: int = 2) -> str:
 
 def overview(top: dict[str, object]) -> str:
     """Every name of the top level, with the first line of its docstring."""
-    rows = ["# Reference", "Names of the top level, `import numpyro_bridges as nb`; the pages beside have the rest."]
+    rows = [
+        "# Reference",
+        "Names of the top level, `import numpyro_bridges as nb`; the pages beside have the rest.",
+    ]
     table = ["| name | what it is |", "|---|---|"]
     for name, value in sorted(top.items(), key=lambda item: item[0].lower()):
-        first = (inspect.getdoc(value) or "").partition("\n\n")[0].replace("\n", " ").replace("|", "\\|")
-        table.append(f"| [`nb.{name}`][{nb.__name__}.{name}] | {first} |")
+        first = (inspect.getdoc(value) or "").partition("\n\n")[0]
+        cell = first.replace("\n", " ").replace("|", "\\|")
+        table.append(f"| [`nb.{name}`][{nb.__name__}.{name}] | {cell} |")
     return "\n\n".join([*rows, "\n".join(table)])

@@ -1,4 +1,4 @@
-"""Signatures of classes whose constructor equinox writes, for mkdocstrings, which reads the source alone."""
+"""Signatures of classes whose constructor equinox writes: mkdocstrings reads the source alone."""
 
 import importlib
 import inspect
@@ -15,13 +15,16 @@ class Constructors(griffe.Extension):
         if not written_by_equinox or inspect.isabstract(value) or _writes_its_own(value):
             return
         parameters = inspect.signature(value).parameters.values()
-        described = [griffe.Parameter("self"), *(_described(parameter, cls) for parameter in parameters)]
+        described = [
+            griffe.Parameter("self"),
+            *(_described(parameter, cls) for parameter in parameters),
+        ]
         constructor = griffe.Function("__init__", parameters=griffe.Parameters(*described))
         cls.set_member("__init__", constructor)
 
 
 def _writes_its_own(value: type) -> bool:
-    """Whether a class or its parents define a constructor in their text; a generated one has no file."""
+    """Whether a class or its parents define a constructor; a generated one has no file."""
     code = getattr(value.__init__, "__code__", None)
     return code is not None and not code.co_filename.startswith("<")
 
