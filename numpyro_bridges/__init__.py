@@ -1,6 +1,14 @@
 """Conditioned stochastic differential equations on function spaces as NumPyro likelihoods."""
 
-from . import datasets as datasets, infer as infer, io as io, plot as plot, scores as scores
+from . import (
+    datasets as datasets,
+    infer as infer,
+    io as io,
+    plot as plot,
+    scores as scores,
+    shapes as shapes,
+    weights as weights,
+)
 from ._compare import Comparison as Comparison, compare as compare
 from .bridges import GuidedBridge as GuidedBridge
 from .conditioning import (

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
+from numpy.typing import ArrayLike
 
 from ._checks import as_float, concrete, require, require_finite, require_instance, require_key
 from ._linalg import apply, congruence, full_precision, promote, varying_like
@@ -103,7 +104,7 @@ class GuidedBridge(eqx.Module):
         sde: AbstractSDE,
         condition: AbstractCondition,
         *,
-        x0: State,
+        x0: ArrayLike,
         t1: RealScalar | None = None,
         t0: RealScalar | None = None,
         num_steps: int | None = None,

@@ -1,13 +1,16 @@
 """The documentation: its code runs, its citations exist, and what is exported is documented."""
 
 import inspect
+import json
 import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import numpyro_bridges as nb
 
@@ -34,8 +37,12 @@ for path, found in blocks[int(first) :: int(count)]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
-    [["extending.md"], ["data.md", "guides.md", "scores.md", "trees.md", "troubleshooting.md"]],
-    ids=["extending", "others"],
+    [
+        ["extending.md"],
+        ["data.md", "guides.md", "scores.md", "trees.md", "troubleshooting.md"],
+        ["hierarchical.md", "observation_sd.md", "long_runs.md"],
+    ],
+    ids=["extending", "others", "models"],
 )
 def test_code_runs_as_it_stands(names, tmp_path):
     """Every block by itself, in single precision as a user's process has it; an error names the line of the page.
@@ -61,6 +68,23 @@ def test_code_runs_as_it_stands(names, tmp_path):
     assert [process.returncode for process in running] == [0, 0], "\n".join(printed)
     blocks = sum(page.read_text(encoding="utf-8").count("\n```python\n") for page in pages)
     assert blocks >= 3 and "".join(printed).count("ran the block") == blocks
+
+
+@pytest.mark.slow
+def test_code_has_the_right_types(tmp_path):
+    """What the pages pass is what the annotations take: pyright over every block, with the settings of the package."""
+    pytest.importorskip("pyright")
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for found in re.finditer(r"^```python\n(.*?)^```", text, re.S | re.M):
+            line = text[: found.start(1)].count("\n")
+            (tmp_path / f"{page.stem}_{line}.py").write_text(found.group(1), encoding="utf-8")
+    settings = {"extraPaths": [str(ROOT)], "typeCheckingMode": "basic", "pythonVersion": "3.11"}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
+    checker = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--project", str(tmp_path)]
+    quiet = {"PYRIGHT_PYTHON_IGNORE_WARNINGS": "1"}
+    done = subprocess.run(checker, env=os.environ | quiet, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def fields(body):
@@ -93,6 +117,31 @@ def test_citations_exist(path):
 def test_every_entry_is_cited():
     text = "".join(path.read_text(encoding="utf-8") for path in [*PAGES, *SOURCES])
     assert [key for key in ENTRIES if f"[@{key}]" not in text] == []
+
+
+def test_versions_agree():
+    """What is said of the version and of dependencies in more than one place is the same."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    recipe = (ROOT / ".ci" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert re.search(r"^version: (\S+)$", citation, re.M).group(1) == project["version"]
+    assert re.search(r'^  version: "(\S+)"$', recipe, re.M).group(1) == project["version"]
+    assert f"## {project['version']}" in (ROOT / "docs" / "changelog.md").read_text(encoding="utf-8")
+    needed = {requirement.replace(" ", "") for requirement in project["dependencies"]}
+    run = recipe[recipe.index("  run:") : recipe.index("tests:")]
+    packaged = {line.replace(" ", "") for line in re.findall(r"^    - (.*)$", run, re.M) if "python" not in line}
+    assert packaged == needed
+
+
+def test_lowest_versions_are_the_bounds():
+    """The constraints with which CI runs once are those that `pyproject.toml` claims, or what others need."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / ".ci" / "lowest.txt").read_text(encoding="utf-8")
+    lowest = dict(re.findall(r"^(\S+)==(\S+)$", lines, re.M))
+    extras = project["optional-dependencies"]
+    for text in [*project["dependencies"], *extras["examples"], *extras["tests"][1:]]:
+        requirement = Requirement(text)
+        assert lowest[requirement.name] in requirement.specifier, text
 
 
 def test_top_level_names_have_docstrings():

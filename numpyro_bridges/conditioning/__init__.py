@@ -1,3 +1,5 @@
+"""What is seen of the end of a process: matches, sets, and their densities."""
+
 from ._base import (
     AbstractCondition as AbstractCondition,
     AbstractMatch as AbstractMatch,

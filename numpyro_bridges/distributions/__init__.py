@@ -1,3 +1,5 @@
+"""Diffusions as distributions of what is observed, and the sites of a NumPyro model."""
+
 from ._driving_noise import DrivingNoise as DrivingNoise, NoiseBlocks as NoiseBlocks
 from ._endpoint import DiffusionEndpoint as DiffusionEndpoint
 from ._noise_driven import AbstractNoiseDriven as AbstractNoiseDriven

@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import Array
+from numpy.typing import ArrayLike
 
 from .._checks import as_float, concrete, exact_float, require, require_finite, require_instance, words
-from .._types import RealScalar, State
+from .._types import RealScalar
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractDensityMatch, AbstractMatch
 from ..guiding import AbstractGuide
@@ -54,7 +55,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
     def __init__(
         self,
         sde: AbstractSDE,
-        x0: State,
+        x0: ArrayLike,
         match: AbstractMatch,
         *,
         t1: RealScalar | None = None,

@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
+from numpy.typing import ArrayLike
 
 from .._checks import (
     as_float,
@@ -29,7 +30,7 @@ from .._checks import (
     words,
 )
 from .._linalg import promote, symmetric
-from .._types import RealScalar, State
+from .._types import RealScalar
 from ..conditioning import AbstractDensityMatch, AbstractMatch, fused
 from ..guiding import AbstractGuide, default_guide
 from ..sdes import AbstractSDE, Flattened, as_covariance, for_every_column
@@ -101,7 +102,7 @@ class DiffusionTree(AbstractNoiseDriven):
     def __init__(
         self,
         sde: AbstractSDE,
-        x0: State,
+        x0: ArrayLike,
         match: AbstractMatch,
         *,
         tree: Tree,

@@ -1,3 +1,5 @@
+"""Guides: what leads the paths of a bridge to its datum, and the steps that they lead."""
+
 from ._continuous import (
     continuous_terms as continuous_terms,
     exact_message as exact_message,

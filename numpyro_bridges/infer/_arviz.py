@@ -8,6 +8,7 @@ node, `DiffusionTree.log_prob_by_node`.
 """
 
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +34,7 @@ def to_arviz(
     noise: bool = False,
     nodes: bool = True,
     paths: int | None = None,
-):
+) -> Any:
     """The result of an MCMC run, for ArviZ.
 
     **Arguments:**

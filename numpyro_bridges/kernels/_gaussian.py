@@ -1,8 +1,10 @@
 """The Gaussian kernel, closed under convolution."""
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import positive_integer
 from ._base import AbstractKernel, AbstractRadialKernel
@@ -21,6 +23,10 @@ class GaussianKernel(AbstractRadialKernel):
 
     amplitude: Float[Array, ""] = eqx.field(converter=positive_scalar("amplitude"))
     length_scale: Float[Array, ""] = eqx.field(converter=positive_scalar("length_scale"))
+
+    if TYPE_CHECKING:  # mypy knows nothing of converters
+
+        def __init__(self, amplitude: ArrayLike, length_scale: ArrayLike) -> None: ...
 
     def profile(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.exp(-0.5 * s)

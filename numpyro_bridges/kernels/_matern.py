@@ -7,13 +7,13 @@ In the scaling r = |x - y| / length_scale, without the factor √(2ν) of much o
 
 from functools import partial
 from math import exp, factorial, lgamma, log, pi
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .._checks import positive_integer, require
 from ._base import AbstractKernel, AbstractRadialKernel
@@ -80,6 +80,10 @@ class MaternKernel(AbstractRadialKernel):
     amplitude: Float[Array, ""] = eqx.field(converter=positive_scalar("amplitude"))
     length_scale: Float[Array, ""] = eqx.field(converter=positive_scalar("length_scale"))
     order: int = eqx.field(static=True, default=4, converter=_order)
+
+    if TYPE_CHECKING:  # mypy knows nothing of converters
+
+        def __init__(self, amplitude: ArrayLike, length_scale: ArrayLike, order: int = 4) -> None: ...
 
     def profile(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         return _matern(self.order, s)

@@ -1,3 +1,5 @@
+"""Learned guides: networks that correct a guide, and ways to train them."""
+
 from ..guiding import ScoreGuide as ScoreGuide, Unguided as Unguided
 from ._fit import fit as fit
 from ._networks import (

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
+from numpy.typing import ArrayLike
 
 from .. import weights
 from .._checks import as_path, choice, concrete, flag, require, require_instance, require_key, words
@@ -53,7 +54,7 @@ def fit(
     sde: AbstractSDE,
     condition: AbstractCondition,
     *,
-    x0: State,
+    x0: ArrayLike,
     t1: RealScalar | None = None,
     key: PRNGKeyArray,
     method: str = "residual",

@@ -1,3 +1,5 @@
+"""Stochastic differential equations: their coefficients, noise and steps."""
+
 from ._base import (
     AbstractSDE as AbstractSDE,
     AffineStep as AffineStep,

@@ -6,7 +6,7 @@ States are `(n, dim)` or `(n,)`; σ acts on the first axis, so a = σσᵀ is n 
 import abc
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -69,7 +69,13 @@ class DiffusionTerm(diffrax.AbstractTerm):
 class AbstractSDE(eqx.Module):
     """dX = b(t, X) dt + σ(t, X) dW. A subclass gives `drift` and `noise`; parameters are array leaves."""
 
-    space: eqx.AbstractVar[AbstractSpace | None]
+    if TYPE_CHECKING:  # no argument of a constructor, and a subclass may make it a property
+
+        @property
+        def space(self) -> AbstractSpace | None: ...
+
+    else:
+        space: eqx.AbstractVar[AbstractSpace | None]
     """Where states live; `None` is Euclidean space."""
 
     has_exact_transition: ClassVar[bool] = False

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from .._checks import as_float, concrete, flag, require, require_instance, words
 from .._types import RealScalar, State, Structured
@@ -139,7 +140,7 @@ class KunitaFlow(AbstractSDE):
     def ito_is_stratonovich(self, x: State) -> bool:
         return self.noise_field.fixed_in_space
 
-    def noise_error(self, x: Float[Array, "... n dim"] | None = None) -> dict:
+    def noise_error(self, x: ArrayLike | None = None) -> dict:
         """What noise that is not exact gets wrong, relative to a(x, x); empty for landmark noise.
 
         **Arguments:** `x`: a state, or a path `(K + 1, n, dim)`, of which the worst state counts. Without it spectral

@@ -2,16 +2,17 @@
 
 import jax
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from .._checks import as_float, floating, require, require_instance
 from .._linalg import add, apply, columns, congruence, full_precision, varying_like
-from .._types import Noise, State, Structured
+from .._types import State, Structured
 from ._base import AbstractSDE, Displaced
 from ._grid import given_grid
 
 
 @full_precision
-def simulate(sde: AbstractSDE, x0: State, ts, noise: Noise) -> State:
+def simulate(sde: AbstractSDE, x0: ArrayLike, ts: ArrayLike, noise: ArrayLike) -> State:
     """A path of the model, unconditioned.
 
     **Arguments:** `x0` `(n, dim)`; `ts` `(K + 1,)`; `noise` `(K, k, dim)`, standard normal.
