@@ -2,6 +2,7 @@
 
 from . import datasets as datasets, infer as infer, io as io, plot as plot, scores as scores
 from ._compare import Comparison as Comparison, compare as compare
+from ._devices import spread as spread
 from .bridges import GuidedBridge as GuidedBridge
 from .conditioning import (
     AbstractCondition as AbstractCondition,
