@@ -42,7 +42,7 @@ def spread(
     **Errors:** `ValueError` where the devices do not divide the batch.
     """
     require(callable(fn), f"`fn` must be a function; got {words(fn)}.")
-    _check_mesh(mesh, axis)
+    require_mesh(mesh, axis)
 
     def spread_fn(*args):
         size = len(jax.tree.leaves(args)[0])
@@ -75,7 +75,7 @@ def mesh_for(
     size: int, name: str, mesh: Mesh | None = None, axis: str | None = None
 ) -> Mesh | None:
     """The mesh on which a batch of `size` items, which an error calls `name`, runs; None where there is one device."""
-    _check_mesh(mesh, axis)
+    require_mesh(mesh, axis)
     if mesh is None:
         local = jax.local_devices() if jax.config.jax_default_device is None else []
         number = max((n for n in range(1, len(local) + 1) if size % n == 0), default=1)
@@ -102,7 +102,8 @@ def gather(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
-def _check_mesh(mesh, axis) -> None:
+def require_mesh(mesh: Any, axis: Any = None) -> None:
+    """A mesh of one axis, or one of whose axes is named, or none."""
     if mesh is None:
         require(axis is None, f"`axis` must be one of `mesh`, and there is none; got {words(axis)}.")
         return
