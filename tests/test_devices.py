@@ -1,6 +1,6 @@
 """Batches on several devices, and in several processes: the same numbers as on one.
 
-The runs of the table are done here, on one device, and by this file as a script on 8 devices. The
+What the table runs is run here, on one device, and by this file as a script on 8 devices. The
 referee is the run on one device, whose own referees are in the tests of what is run.
 """
 
@@ -13,11 +13,15 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
-from jax.sharding import Mesh
+from jax.sharding import Mesh, PartitionSpec
+from numpyro.infer import HMC, MCMC
 
 import numpyro_bridges as nb
 from numpyro_bridges._devices import gather
+from numpyro_bridges.infer import FunctionSpaceHMC, run_checkpointed
 
 pytestmark = [pytest.mark.usefixtures("compile_quickly"), pytest.mark.numpyro]
 
@@ -27,18 +31,23 @@ MATCH = nb.InexactMatch(0.01)
 BRIDGE = nb.GuidedBridge(OU, MATCH.at(DATUM), x0=X0, t1=1.0, num_steps=2, guide=nb.Unguided())
 
 
-def evidence(mesh):
+def model(datum):
+    mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
+    law = nb.DiffusionEndpoint(nb.LinearSDE(-1.0, 0.6, mean), X0, MATCH, t1=1.0, num_steps=1)
+    nb.sample("wing", law, obs=datum)
+
+
+def evidence(mesh, folder):
     found = nb.estimate_evidence(BRIDGE, jr.key(0), 48, batch_size=2, mesh=mesh)
     return found.log_weights, found.log_evidence, found.standard_error, found.ess
 
 
-def comparison(mesh):
-    bridges = {"unguided": BRIDGE, "guided": BRIDGE.with_guide(nb.FrozenGuide())}
-    rows = nb.compare(bridges, jr.key(1), num_particles=16, mesh=mesh).rows.values()
-    return [row[name] for row in rows for name in ("log_evidence", "ess")]
+def comparison(mesh, folder):
+    found = nb.compare({"a": BRIDGE}, jr.key(1), num_particles=48, batch_size=2, mesh=mesh)
+    return [found.rows["a"][name] for name in ("log_evidence", "standard_error", "ess")]
 
 
-def tempered(mesh):
+def tempered(mesh, folder):
     """A pilot run of particles, and chains."""
     law = nb.DiffusionEndpoint(OU, X0, MATCH, t1=1.0, num_steps=1)
     sizes = {"num_particles": 8, "num_islands": 8, "num_moves": 2, "batch_size": 8}
@@ -48,18 +57,41 @@ def tempered(mesh):
     return found.log_estimates, found.inverse_temperatures, found.accept_prob
 
 
+SIZES = {"num_warmup": 3, "num_samples": 3, "num_chains": 8, "progress_bar": False}
+
+
+def vectorised(mesh, folder):
+    mcmc = MCMC(FunctionSpaceHMC(model, mesh=mesh), chain_method="vectorized", **SIZES)
+    mcmc.run(jr.key(3), DATUM)
+    return gather(mcmc.get_samples(group_by_chain=True)["mean"]), gather(mcmc.last_state.z["mean"])
+
+
+def hmc():
+    return HMC(model, trajectory_length=None, num_steps=2)
+
+
+def checkpointed(mesh, folder):
+    mcmc = MCMC(hmc(), chain_method="sequential", **SIZES)
+    run_checkpointed(mcmc, folder / "whole", jr.key(4), DATUM, interval=2, mesh=mesh)
+    return mcmc.get_samples(group_by_chain=True)["mean"], mcmc.last_state.z["wing_noise"]
+
+
 RUNS = {
     "evidence": evidence,
     "comparison": comparison,
     "tempered": tempered,
+    "vectorised": vectorised,
+    "checkpointed": checkpointed,
 }
 
 
-def results(mesh) -> dict:
-    return {name: np.concatenate([np.ravel(x) for x in run(mesh)]) for name, run in RUNS.items()}
+def results(mesh, folder) -> dict:
+    return {
+        name: np.concatenate([np.ravel(x) for x in run(mesh, folder)]) for name, run in RUNS.items()
+    }
 
 
-def started(file, num_devices, *arguments):
+def started(folder, num_devices, *arguments):
     settings = {
         "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={num_devices}",
         "JAX_ENABLE_X64": "1",
@@ -67,7 +99,7 @@ def started(file, num_devices, *arguments):
         "PYTHONPATH": str(Path(nb.__file__).parents[1]),
     }
     return subprocess.Popen(
-        [sys.executable, __file__, str(file), *arguments],
+        [sys.executable, __file__, str(folder), *map(str, arguments)],
         env=os.environ | settings,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -78,12 +110,12 @@ def started(file, num_devices, *arguments):
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     """On one device, and on 8."""
-    file = tmp_path_factory.mktemp("devices") / "found.npz"
-    process = started(file, 8)
-    one = results(None)
+    folders = [tmp_path_factory.mktemp(name) for name in ("one", "eight")]
+    process = started(folders[1], 8)
+    one = results(None, folders[0])
     printed = process.communicate(timeout=300)[0]
     assert process.returncode == 0, printed[-3000:]
-    with np.load(file) as eight:
+    with np.load(folders[1] / "found.npz") as eight:
         return one, dict(eight)
 
 
@@ -94,10 +126,58 @@ def test_eight_devices_are_one(name, found):
     np.testing.assert_allclose(eight, one, rtol=1e-12, atol=1e-12)
 
 
-def main(file):
+def check_spread():
+    """Against NumPy: values, and on which of 8 devices they are."""
+    devices = jax.devices()
+    mesh = Mesh(np.array(devices), "i")
+    x = np.arange(24.0).reshape(24, 1)
+    shift = jnp.ones(1)
+
+    def fn(x, key):
+        return {"moved": 2 * x["x"] + shift, "key": jr.fold_in(key, 1), "none": None}
+
+    def check(found, number):
+        assert len(found["moved"].sharding.device_set) == number
+        np.testing.assert_array_equal(found["moved"], 2 * x[: len(found["moved"])] + 1)
+
+    def run(size, *args, **settings):
+        batch = {"x": x[:size]}, jr.split(jr.key(0), 24)[:size]
+        return jax.jit(nb.spread(fn, *args, **settings))(*batch)
+
+    keys = jr.key_data(run(24, Mesh(np.array(devices[:1]), "i"))["key"])
+    for settings in ({}, {"batch_size": 2}, {"batch_size": 3}, {"axis": "i"}):
+        found = run(24, mesh, **settings)
+        check(found, 8)
+        np.testing.assert_array_equal(jr.key_data(found["key"]), keys)
+    check(run(8, mesh), 8)  # one each
+    # by default, as many as have equal shares; 11 are prime
+    for size, number in ((24, 8), (12, 6), (4, 4), (1, 1), (11, 1)):
+        check(run(size), number)
+    with jax.default_device(devices[3]):
+        found = run(24)
+        assert found["moved"].sharding.device_set == {devices[3]}
+    # along one axis of two, and a mesh of explicit types, of whose results no sharding is asked
+    grid = Mesh(np.array(devices).reshape(4, 2), ("rows", "columns"))
+    check(run(4, grid, axis="rows"), 8)
+    explicit = jax.make_mesh((8,), ("i",), axis_types=(jax.sharding.AxisType.Explicit,))
+    found = run(24, explicit)
+    np.testing.assert_array_equal(jnp.sort(found["moved"][::3], axis=0), 2 * x[::3] + 1)
+
+    def loop(x):
+        return jax.lax.fori_loop(0, x, lambda i, sum: sum + i, 0)
+
+    numbers = np.arange(16)
+    np.testing.assert_array_equal(
+        jax.jit(nb.spread(loop, mesh))(numbers), numbers * (numbers - 1) // 2
+    )
+
+
+def main(folder):
+    folder = Path(folder)
+    check_spread()
     mesh = Mesh(np.array(jax.devices()), "devices")
     assert mesh.size == 8
-    np.savez(file, **results(mesh))
+    np.savez(folder / "found.npz", **results(mesh, folder))
 
 
 if __name__ == "__main__":
