@@ -102,6 +102,17 @@ def gather(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
+def is_writer(mesh: Mesh | None) -> bool:
+    """Whether this process writes the files of a run on a mesh, the first where there are several."""
+    return mesh is None or not mesh.is_multi_process or jax.process_index() == 0
+
+
+def wait_for_all(mesh: Mesh | None, what: str) -> None:
+    """Until all processes of a mesh are here."""
+    if mesh is not None and mesh.is_multi_process:
+        multihost_utils.sync_global_devices(what)
+
+
 def require_mesh(mesh: Any, axis: Any = None) -> None:
     """A mesh of one axis, or one of whose axes is named, or none."""
     if mesh is None:

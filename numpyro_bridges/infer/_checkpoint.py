@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
-from jax.experimental.multihost_utils import sync_global_devices
 from jax.sharding import Mesh
 from jax.tree_util import keystr, tree_flatten_with_path
 from numpyro.infer import MCMC
@@ -31,7 +30,7 @@ from numpyro.util import is_prng_key, nested_attrgetter
 from tqdm.auto import tqdm
 
 from .._checks import as_path, positive_integer, require, require_instance, require_key, words
-from .._devices import gather, mesh_for, spread
+from .._devices import gather, is_writer, mesh_for, spread, wait_for_all
 from .._files import write_whole
 from ._posterior import noise_sites, sites_of
 
@@ -104,9 +103,9 @@ def run_checkpointed(
             while done < total:
                 stop = min((done // interval + 1) * interval, total)
                 state, draws = chains.advance(state, done, stop)
-                if draws and chains.writes:
-                    _write(_draws_file(folder, done), draws)
-                if chains.writes:
+                if is_writer(chains.mesh):
+                    if draws:
+                        _write(_draws_file(folder, done), draws)
                     _write(folder / "state.npz", chains.record(state, stop))
                 divergences += np.sum(draws.get("diverging", 0))
                 bar.update(stop - done)
@@ -124,8 +123,7 @@ def run_checkpointed(
             file=sys.stderr,
         )
         raise
-    if chains.shared:
-        sync_global_devices(f"the draws of {folder} are written")
+    wait_for_all(chains.mesh, "the draws are written")
     _hand_over(folder, chains, state, done)
 
 
@@ -141,9 +139,7 @@ class _Chains:
         self.noise = () if keep_noise == 1 else _noise_of(self.sampler, args, kwargs)
         self.keep_noise = keep_noise
         self.batched = mcmc.num_chains > 1 and mcmc.chain_method == "vectorized" and mesh is None
-        together = mesh or getattr(mcmc.sampler, "_mesh", None)
-        self.shared = together is not None and together.is_multi_process
-        self.writes = not self.shared or jax.process_index() == 0
+        self.mesh = mesh or getattr(mcmc.sampler, "_mesh", None)
 
         keys = jr.split(rng_key, mcmc.num_chains) if mcmc.num_chains > 1 and is_prng_key(rng_key) else rng_key
         init = _over_chains(mcmc, mesh, lambda x, _: self.sampler.init(x[0], mcmc.num_warmup, x[1], args, kwargs))
