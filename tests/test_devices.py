@@ -1,10 +1,12 @@
 """Batches on several devices, and in several processes: the same numbers as on one.
 
-What the table runs is run here, on one device, and by this file as a script on 8 devices. The
-referee is the run on one device, whose own referees are in the tests of what is run.
+What the table runs is run here, on one device, and by this file as a script on 8 devices, and in two
+processes of two devices each. The referee is the run on one device, whose own referees are in the
+tests of what is run.
 """
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -21,9 +23,14 @@ from numpyro.infer import HMC, MCMC
 
 import numpyro_bridges as nb
 from numpyro_bridges._devices import gather
-from numpyro_bridges.infer import FunctionSpaceHMC, run_checkpointed
+from numpyro_bridges.infer import FunctionSpaceHMC, _checkpoint, run_checkpointed
+from numpyro_bridges.scores import _training
 
 pytestmark = [pytest.mark.usefixtures("compile_quickly"), pytest.mark.numpyro]
+
+if __name__ == "__main__" and len(sys.argv) > 2:
+    # after the package is imported, and before anything is computed
+    jax.distributed.initialize(f"localhost:{sys.argv[3]}", 2, int(sys.argv[2]))
 
 X0, DATUM = np.array([0.2]), np.array([0.9])
 OU = nb.LinearSDE(-1.0, 0.5)
@@ -49,7 +56,7 @@ def comparison(mesh, folder):
 
 def tempered(mesh, folder):
     """A pilot run of particles, and chains."""
-    law = nb.DiffusionEndpoint(OU, X0, MATCH, t1=1.0, num_steps=1)
+    law = nb.DiffusionEndpoint(OU, X0, MATCH, t1=1.0, num_steps=2, guide=nb.Unguided())
     sizes = {"num_particles": 8, "num_islands": 8, "num_moves": 2, "batch_size": 8}
     found = nb.estimate_tree_evidence(
         law, DATUM, jr.key(2), method="bridge", progress=False, mesh=mesh, **sizes
@@ -107,15 +114,18 @@ RUNS = {
 }
 
 
-def results(mesh, folder) -> dict:
-    return {
-        name: np.concatenate([np.ravel(x) for x in run(mesh, folder)]) for name, run in RUNS.items()
-    }
+IN_TWO_PROCESSES = ["evidence", "vectorised", "checkpointed", "trained"]
+
+
+def results(mesh, folder, names=RUNS) -> dict:
+    found = {name: RUNS[name](mesh, folder) for name in names}
+    return {name: np.concatenate([np.ravel(x) for x in values]) for name, values in found.items()}
 
 
 def started(folder, num_devices, *arguments):
+    count = f"--xla_force_host_platform_device_count={num_devices}"
     settings = {
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={num_devices}",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {count}",
         "JAX_ENABLE_X64": "1",
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
         "PYTHONPATH": str(Path(nb.__file__).parents[1]),
@@ -129,23 +139,40 @@ def started(folder, num_devices, *arguments):
     )
 
 
+def ended(process, file) -> dict:
+    """What it has found."""
+    printed = process.communicate(timeout=300)[0]
+    assert process.returncode == 0, printed[-3000:]
+    with np.load(file) as found:
+        return dict(found)
+
+
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     """On one device, and on 8."""
-    folders = [tmp_path_factory.mktemp(name) for name in ("one", "eight")]
-    process = started(folders[1], 8)
-    one = results(None, folders[0])
-    printed = process.communicate(timeout=300)[0]
-    assert process.returncode == 0, printed[-3000:]
-    with np.load(folders[1] / "found.npz") as eight:
-        return one, dict(eight)
+    one, eight = (tmp_path_factory.mktemp(name) for name in ("one", "eight"))
+    process = started(eight, 8)
+    return results(None, one), ended(process, eight / "found_0.npz")
 
 
 @pytest.mark.parametrize("name", RUNS)
 def test_eight_devices_are_one(name, found):
-    one, eight = found[0][name], found[1][name]
+    one, eight = (results[name] for results in found)
     assert np.std(one) > 0.1
     np.testing.assert_allclose(eight, one, rtol=1e-12, atol=1e-12)
+
+
+def test_two_processes_are_one(found, tmp_path):
+    """Each of them knows all; files are written by the first, and read by both."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    processes = [started(tmp_path, 2, rank, port) for rank in range(2)]
+    for rank, process in enumerate(processes):
+        two = ended(process, tmp_path / f"found_{rank}.npz")
+        assert set(two) == set(IN_TWO_PROCESSES)
+        for name in two:
+            np.testing.assert_allclose(two[name], found[0][name], rtol=1e-12, atol=1e-12)
 
 
 def check_spread():
@@ -195,12 +222,16 @@ def check_spread():
 
 
 def main(folder):
-    folder = Path(folder)
-    check_spread()
+    rank, names, count = jax.process_index(), IN_TWO_PROCESSES, 4
+    if jax.process_count() == 1:
+        check_spread()
+        names, count = RUNS, 8
+    if rank == 1:
+        _checkpoint._write = _training._save = None  # writing is an error
     mesh = Mesh(np.array(jax.devices()), "devices")
-    assert mesh.size == 8
-    np.savez(folder / "found.npz", **results(mesh, folder))
+    assert mesh.size == count
+    np.savez(Path(folder) / f"found_{rank}.npz", **results(mesh, Path(folder), names))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(sys.argv[1])
