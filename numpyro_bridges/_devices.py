@@ -12,7 +12,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 
-from ._checks import require, require_instance, words
+from ._checks import positive_integer, require, require_instance, words
 
 
 def spread(
@@ -43,6 +43,7 @@ def spread(
     """
     require(callable(fn), f"`fn` must be a function; got {words(fn)}.")
     require_mesh(mesh, axis)
+    batch_size = None if batch_size is None else positive_integer(batch_size, "batch_size")
 
     def spread_fn(*args):
         size = len(jax.tree.leaves(args)[0])
@@ -97,7 +98,9 @@ def gather(tree: Any) -> Any:
         if not isinstance(x, jax.Array) or len(x.sharding.device_set) == 1:
             return x
         here = x.is_fully_addressable or x.is_fully_replicated
-        return jnp.asarray(np.asarray(x if here else multihost_utils.process_allgather(x, tiled=True)))
+        return jnp.asarray(
+            np.asarray(x if here else multihost_utils.process_allgather(x, tiled=True))
+        )
 
     return jax.tree.map(whole, tree)
 
@@ -116,7 +119,9 @@ def wait_for_all(mesh: Mesh | None, what: str) -> None:
 def require_mesh(mesh: Any, axis: Any = None) -> None:
     """A mesh of one axis, or one of whose axes is named, or none."""
     if mesh is None:
-        require(axis is None, f"`axis` must be one of `mesh`, and there is none; got {words(axis)}.")
+        require(
+            axis is None, f"`axis` must be one of `mesh`, and there is none; got {words(axis)}."
+        )
         return
     require_instance(
         mesh, Mesh, "mesh", 'a `jax.sharding.Mesh`, such as `jax.make_mesh((8,), ("devices",))`'

@@ -18,7 +18,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 from numpyro.infer import HMC, MCMC
 
 import numpyro_bridges as nb
@@ -78,9 +78,18 @@ def hmc():
 
 
 def checkpointed(mesh, folder):
-    mcmc = MCMC(hmc(), chain_method="sequential", **SIZES)
-    run_checkpointed(mcmc, folder / "whole", jr.key(4), DATUM, interval=2, mesh=mesh)
-    return mcmc.get_samples(group_by_chain=True)["mean"], mcmc.last_state.z["wing_noise"]
+    def run(name, method="sequential", mesh=mesh, **settings):
+        mcmc = MCMC(hmc(), chain_method=method, **SIZES | settings)
+        run_checkpointed(mcmc, folder / name, jr.key(4), DATUM, interval=2, mesh=mesh)
+        return mcmc.get_samples(group_by_chain=True)["mean"]
+
+    found = run("whole")
+    if mesh is None or mesh.is_multi_process:
+        return found, found
+    # cut off, it goes on bit for bit
+    run("cut", num_samples=1)
+    np.testing.assert_array_equal(run("cut"), found)
+    return found, run("parallel", "parallel", None)
 
 
 def trained(mesh, folder):
@@ -173,6 +182,92 @@ def test_two_processes_are_one(found, tmp_path):
         assert set(two) == set(IN_TWO_PROCESSES)
         for name in two:
             np.testing.assert_allclose(two[name], found[0][name], rtol=1e-12, atol=1e-12)
+
+
+ONE = jax.devices()[:1]
+EIGHT = Mesh(np.array(ONE * 8), "devices")  # for what is refused before anything runs
+GRID = Mesh(np.array(ONE * 4).reshape(2, 2), ("rows", "columns"))
+
+
+def several(num_chains, **settings):
+    sizes = {"num_warmup": 1, "num_samples": 1, "progress_bar": False}
+    return MCMC(num_chains=num_chains, **sizes, **settings)
+
+
+REFUSED = {
+    "shares": (
+        lambda: nb.spread(jnp.sin, EIGHT)(np.ones(12)),
+        "the batch must be a multiple of the 8 devices of `mesh`; got 12. Make it one, or give",
+    ),
+    "axes": (
+        lambda: nb.spread(jnp.sin, GRID),
+        r"`mesh` must have one axis; got 2, \('rows', 'columns'\). Make it `jax.sharding.Mesh\(mesh.dev",
+    ),
+    "axis": (
+        lambda: nb.spread(jnp.sin, GRID, axis="devices"),
+        r"`axis` must be one of `mesh`, \('rows', 'columns'\); got 'devices'",
+    ),
+    "no mesh": (
+        lambda: nb.spread(jnp.sin, axis="rows"),
+        "`axis` must be one of `mesh`, and there is none; got 'rows'",
+    ),
+    "list": (
+        lambda: nb.spread(jnp.sin, ONE),
+        r"`mesh` must be a `jax.sharding.Mesh`, such as `jax.make_mesh\(\(8,\), .*; got \[",
+    ),
+    "evidence": (
+        lambda: nb.estimate_evidence(BRIDGE, jr.key(0), 12, mesh=EIGHT),
+        "`num_particles` must be a multiple of the 8 devices of `mesh`; got 12",
+    ),
+    "comparison": (
+        lambda: nb.compare({"a": BRIDGE}, jr.key(0), num_particles=12, mesh=EIGHT),
+        "`num_particles` must be a multiple of the 8 devices of `mesh`; got 12",
+    ),
+    "tempered": (
+        lambda: nb.estimate_model_evidence(
+            model, jr.key(0), DATUM, num_particles=8, num_islands=4, method="bridge", mesh=EIGHT
+        ),
+        "`num_islands` must be a multiple of the 8 devices of `mesh`; got 4",
+    ),
+    "kernel": (lambda: FunctionSpaceHMC(model, mesh=GRID), "`mesh` must have one axis"),
+    "chains": (
+        lambda: several(6, sampler=KERNEL, chain_method="vectorized").run(jr.key(0), DATUM),
+        "`num_chains` must be a multiple of the 8 devices of `mesh`; got 6",
+    ),
+    "one chain": (
+        lambda: several(8, sampler=KERNEL, chain_method="sequential").run(jr.key(0), DATUM),
+        "`mesh` is for chains that run at once, and this is one: `MCMC",
+    ),
+    "checkpointed": (
+        lambda: run_checkpointed(several(6, sampler=hmc()), "unused", jr.key(0), mesh=EIGHT),
+        "`num_chains` of `mcmc` must be a multiple of the 8 devices of `mesh`; got 6",
+    ),
+    "one checkpointed": (
+        lambda: run_checkpointed(several(1, sampler=hmc()), "unused", jr.key(0), mesh=EIGHT),
+        "`mesh` is for several chains, and `mcmc` has 1",
+    ),
+    "trained": (
+        lambda: nb.scores.fit(
+            OU,
+            MATCH.at(DATUM),
+            x0=X0,
+            t1=1.0,
+            key=jr.key(0),
+            training=nb.scores.Training(batch_size=12),
+            mesh=EIGHT,
+        ),
+        "`batch_size` of `training` must be a multiple of the 8 devices of `mesh`; got 12",
+    ),
+}
+KERNEL = FunctionSpaceHMC(model, mesh=EIGHT)
+
+
+@pytest.mark.filterwarnings("ignore:There are not enough devices to run parallel chains")
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused(name):
+    call, message = REFUSED[name]
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 def check_spread():
