@@ -68,9 +68,14 @@ SIZES = {"num_warmup": 3, "num_samples": 3, "num_chains": 8, "progress_bar": Fal
 
 
 def vectorised(mesh, folder):
+    """By default on all devices of a process."""
+    if mesh is not None and not mesh.is_multi_process:
+        mesh = None
     mcmc = MCMC(FunctionSpaceHMC(model, mesh=mesh), chain_method="vectorized", **SIZES)
     mcmc.run(jr.key(3), DATUM)
-    return gather(mcmc.get_samples(group_by_chain=True)["mean"]), gather(mcmc.last_state.z["mean"])
+    samples = mcmc.get_samples(group_by_chain=True)["mean"]
+    assert len(samples.sharding.device_set) == jax.device_count()
+    return gather(samples), gather(mcmc.last_state.z["mean"])
 
 
 def hmc():

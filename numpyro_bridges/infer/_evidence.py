@@ -120,6 +120,7 @@ def estimate_tree_evidence(law: AbstractNoiseDriven, data, key: Array, **setting
     **Returns:** a `TemperedEvidence`.
     """
     require_instance(law, AbstractNoiseDriven, "law", "a law with driving noise, such as `DiffusionTree`")
+    require(data is not None, "`data` must be an array shaped as `law`; got None, which would be no data.")
     return estimate_model_evidence(_observed, key, law, data, **settings)
 
 
