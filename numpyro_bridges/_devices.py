@@ -78,7 +78,8 @@ def mesh_for(
     """The mesh on which a batch of `size` items, which an error calls `name`, runs; None where there is one device."""
     require_mesh(mesh, axis)
     if mesh is None:
-        local = jax.local_devices() if jax.config.jax_default_device is None else []
+        chosen = getattr(jax.config, "jax_default_device", None)
+        local = jax.local_devices() if chosen is None else []
         number = max((n for n in range(1, len(local) + 1) if size % n == 0), default=1)
         return None if number == 1 else Mesh(np.array(local[:number]), "devices")
     number = mesh.shape[axis or mesh.axis_names[0]]

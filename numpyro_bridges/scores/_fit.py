@@ -48,7 +48,7 @@ class Problem(NamedTuple):
     guide: ScoreGuide
     training: Training
     train: Callable
-    mesh: Mesh | None
+    mesh: Mesh | None = None
 
     def spread(self, fn: Callable, size: int) -> Callable:
         """`fn` for a batch of a size; whole on each device where that has no equal shares."""
@@ -105,8 +105,8 @@ def fit(
     - `watch`: `watch(name, guide)` is called at each look, with the guide as it then is and the history so far; `name`
       is the method's, or `"time reversal"` in the first pass of `"reversal"`.
     - `mesh`: the devices that share a batch and the held-out paths, as for `numpyro_bridges.spread`. With `draw` the
-      problems of a batch are shared, where there are equal shares of them. The particles of one cloud are not, of
-      `"adjoint"` and `"reversal"` without `draw`.
+      problems of a batch are shared, where there are equal shares of them. Of a cloud, of `"adjoint"` and `"reversal"`
+      without `draw`, they share the network's work, and each makes the cloud.
 
     **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
     training with a warning.
@@ -365,7 +365,8 @@ def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
         if draws == 1:
             inputs, error = rows(network, key)
             t, x, *fixed = inputs
-            output, network = over_batch(network, t.ravel(), x.reshape(t.size, *x.shape[2:]), *fixed)
+            states = x.reshape(t.size, *x.shape[2:])
+            output, network = over_batch(network, t.ravel(), states, *fixed, problem.spread)
             return error(output.reshape(*t.shape, *output.shape[1:])), network
 
         def one(key):
