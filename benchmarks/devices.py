@@ -84,7 +84,9 @@ def tasks(mesh, num_paths, num_chains):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--paths", type=int, default=1024)
     parser.add_argument("--chains", type=int, default=16)

@@ -22,6 +22,7 @@ from jax.sharding import Mesh
 from numpyro.infer import HMC, MCMC
 
 import numpyro_bridges as nb
+from numpyro_bridges import _checks
 from numpyro_bridges._devices import gather
 from numpyro_bridges.infer import FunctionSpaceHMC, _checkpoint, run_checkpointed
 from numpyro_bridges.scores import _training
@@ -307,28 +308,39 @@ def check_spread():
         assert found["moved"].sharding.device_set == {devices[3]}
     # along one axis of two, and a mesh of explicit types, of whose results no sharding is asked
     grid = Mesh(np.array(devices).reshape(4, 2), ("rows", "columns"))
-    check(run(4, grid, axis="rows"), 8)
+    check(run(6, grid, axis="columns"), 8)
     explicit = jax.make_mesh((8,), ("i",), axis_types=(jax.sharding.AxisType.Explicit,))
     found = run(24, explicit)
     np.testing.assert_array_equal(jnp.sort(found["moved"][::3], axis=0), 2 * x[::3] + 1)
 
     def loop(x):
-        return jax.lax.fori_loop(0, x, lambda i, sum: sum + i, 0)
+        """As long as x says, from a constant."""
+        return jax.lax.fori_loop(0, x, lambda i, sum: sum + x, 0)
 
     numbers = np.arange(16)
-    np.testing.assert_array_equal(
-        jax.jit(nb.spread(loop, mesh))(numbers), numbers * (numbers - 1) // 2
-    )
+    np.testing.assert_array_equal(jax.jit(nb.spread(loop, mesh))(numbers), numbers**2)
+
+
+def check_parts(mesh):
+    """Of values of which other processes hold parts nothing is asked but what all of them can do."""
+    x = jax.jit(nb.spread(lambda x: -x, mesh))(np.ones(4))
+    assert _checks.concrete(x) is None and _checks.known(x, "x") is None
+    match = nb.InexactMatch(x)  # which is refused where it is known to be negative
+    np.testing.assert_array_equal(gather(match.variance), -np.ones(4))
+    with pytest.raises(ValueError, match="`x` must be known before .* each process holds all"):
+        _checks.known_float(x, "x")
 
 
 def main(folder):
     rank, names, count = jax.process_index(), IN_TWO_PROCESSES, 4
+    mesh = Mesh(np.array(jax.devices()), "devices")
     if jax.process_count() == 1:
         check_spread()
         names, count = RUNS, 8
+    else:
+        check_parts(mesh)
     if rank == 1:
         _checkpoint._write = _training._save = None  # writing is an error
-    mesh = Mesh(np.array(jax.devices()), "devices")
     assert mesh.size == count
     np.savez(Path(folder) / f"found_{rank}.npz", **results(mesh, Path(folder), names))
 
