@@ -10,6 +10,7 @@ from . import (
     weights as weights,
 )
 from ._compare import Comparison as Comparison, compare as compare
+from ._devices import spread as spread
 from .bridges import GuidedBridge as GuidedBridge
 from .conditioning import (
     AbstractCondition as AbstractCondition,

@@ -58,8 +58,13 @@ _short.maxstring = _short.maxother = _short.maxlong = 80
 
 
 def concrete(x: Any) -> np.ndarray | None:
-    """The value as a NumPy array, or None while a program is traced."""
-    return None if isinstance(x, Tracer) else np.asarray(x)
+    """The value as a NumPy array, or None while a program is traced, and where other processes hold a part of it."""
+    return np.asarray(x) if _is_here(x) else None
+
+
+def _is_here(x: Any) -> bool:
+    """Whether this process can look at a value, whatever other processes do."""
+    return not isinstance(x, Tracer) and getattr(x, "is_fully_addressable", True)
 
 
 def words(value: Any) -> str:
@@ -93,15 +98,16 @@ def known(x: Any, name: str) -> np.ndarray | None:
     decided by this, so that it does not depend on where an object is built.
     """
     x = _real(x, name)
-    return None if isinstance(x, Tracer) else np.asarray(x, float)
+    return np.asarray(x, float) if _is_here(x) else None
 
 
 def known_float(x: Any, name: str) -> np.ndarray:
     """A NumPy array of double precision, for what is prepared outside traced programs."""
     x = _real(x, name)
     require(
-        not isinstance(x, Tracer),
-        f"`{name}` must be known before tracing; got {words(x)}. Call this outside `jax.jit` and `jax.vmap`.",
+        _is_here(x),
+        f"`{name}` must be known before tracing; got {words(x)}. Call this outside `jax.jit` and `jax.vmap`, with a "
+        "value of which each process holds all.",
     )
     return np.asarray(x, float)
 
@@ -112,7 +118,7 @@ def exact_float(x: Any, name: str) -> jax.Array | np.ndarray:
     For what must be subtracted before it is rounded, such as times.
     """
     x = _real(x, name)
-    return jnp.asarray(x, float) if isinstance(x, Tracer) else np.asarray(x, float)
+    return np.asarray(x, float) if _is_here(x) else jnp.asarray(x, float)
 
 
 def _real(x: Any, name: str) -> jax.Array | np.ndarray:

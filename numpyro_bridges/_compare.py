@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import PRNGKeyArray
 
 from . import weights
@@ -164,6 +165,7 @@ def compare(
     batch_size: int | None = None,
     training_seconds: Mapping[str, float] | None = None,
     score: Callable[[RealScalar, State], State] | None = None,
+    mesh: Mesh | None = None,
 ) -> Comparison:
     """Estimate one evidence by several bridges, and say whether they agree and what each costs.
 
@@ -172,7 +174,7 @@ def compare(
     - `bridges`: by name; they differ in nothing but their guides, `{"a": bridge, "b": bridge.with_guide(guide)}`.
     - `key`: split, so that the estimates' errors are independent.
     - `num_particles`: number S of paths of each bridge. Of a single one there is no standard error, and no trust.
-    - `batch_size`: how many run at once; memory is bounded by it. At most 256 by default.
+    - `batch_size`: how many a device runs at once; memory is bounded by it. At most 256 by default.
     - `training_seconds`: by name, seconds spent on training a guide. By default the last entry of
       `guide.history["seconds"]` where the guide has a history, and 0 where it has none.
     - `score`: (t, x) ↦ ∇ log h(t, x), shaped like x, where it is known. The `score_error` of a guide's score s is then
@@ -180,6 +182,7 @@ def compare(
           E ∫ |s − ∇ log h|²_a dt / E ∫ |∇ log h|²_a dt,    |u|²_a = uᵀ a(t, x) u,
 
       over 64 of the weighted paths (self-normalised) and the steps of the grid, t and x being those at a step's start.
+    - `mesh`: the devices that share the paths of each bridge, as for `spread`.
 
     **Returns:** a `Comparison`. Run times are measured after compilation, one bridge after the other.
 
@@ -198,7 +201,7 @@ def compare(
     batch_size = min(256, num_particles) if batch_size is None else positive_integer(batch_size, "batch_size")
     rows = {}
     for (name, bridge), key_bridge in zip(bridges.items(), jr.split(key, len(bridges)), strict=True):
-        estimate, seconds = timed_estimate(bridge, key_bridge, num_particles, batch_size)
+        estimate, seconds = timed_estimate(bridge, key_bridge, num_particles, batch_size, mesh)
         trained = training_seconds.get(name, _trained_seconds(bridge))
         trained = known_number(trained, f"training_seconds[{name!r}]")
         keys = jr.split(key_bridge, num_particles)[:_SCORE_PATHS]

@@ -7,10 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from . import weights
 from ._checks import positive_integer, require_instance, require_key
+from ._devices import gather, mesh_for, spread
 from .bridges import GuidedBridge
 
 
@@ -67,12 +69,17 @@ class EvidenceEstimate(eqx.Module):
 
 
 def estimate_evidence(
-    bridge: GuidedBridge, key: PRNGKeyArray, num_particles: int, *, batch_size: int = 256
+    bridge: GuidedBridge,
+    key: PRNGKeyArray,
+    num_particles: int,
+    *,
+    batch_size: int = 256,
+    mesh: Mesh | None = None,
 ) -> EvidenceEstimate:
     """Estimate p(condition | x0) from independent guided paths.
 
-    **Arguments:** `num_particles`: number of paths, at least 2. `batch_size`: how many run at once; memory is
-    bounded by it.
+    **Arguments:** `num_particles`: number of paths, at least 2. `batch_size`: how many a device runs at once; memory is
+    bounded by it. `mesh`: the devices that share the paths, as for `spread`.
 
     **Returns:** an `EvidenceEstimate`. A path that failed numerically makes it NaN.
     """
@@ -80,21 +87,26 @@ def estimate_evidence(
     batch_size = positive_integer(batch_size, "batch_size")
     require_instance(bridge, GuidedBridge, "bridge", "a `GuidedBridge`")
     require_key(key)
-    batches = _batches(key, num_particles, batch_size)
-    return estimate_from(bridge, jnp.concatenate([_log_weights(bridge, keys) for keys in batches]))
+    batches, mesh = _batches(key, num_particles, batch_size, mesh)
+    found = [_log_weights(bridge, keys, mesh) for keys in batches]
+    return estimate_from(bridge, jnp.concatenate(gather(found)))
 
 
 def timed_estimate(
-    bridge: GuidedBridge, key: PRNGKeyArray, num_particles: int, batch_size: int
+    bridge: GuidedBridge,
+    key: PRNGKeyArray,
+    num_particles: int,
+    batch_size: int,
+    mesh: Mesh | None,
 ) -> tuple[EvidenceEstimate, float]:
     """The same, of any number of particles, and the seconds that the paths took after compilation."""
-    batches = _batches(key, num_particles, batch_size)
+    batches, mesh = _batches(key, num_particles, batch_size, mesh)
     for keys in {len(keys): keys for keys in batches}.values():
-        jax.block_until_ready(_log_weights(bridge, keys))
+        jax.block_until_ready(_log_weights(bridge, keys, mesh))
     start = time.perf_counter()
-    found = [jax.block_until_ready(_log_weights(bridge, keys)) for keys in batches]
+    found = [jax.block_until_ready(_log_weights(bridge, keys, mesh)) for keys in batches]
     seconds = time.perf_counter() - start
-    return estimate_from(bridge, jnp.concatenate(found)), seconds
+    return estimate_from(bridge, jnp.concatenate(gather(found))), seconds
 
 
 def estimate_from(bridge: GuidedBridge, log_weights: Array) -> EvidenceEstimate:
@@ -113,14 +125,22 @@ def driving_noise(bridge: GuidedBridge, key: PRNGKeyArray) -> Array:
     return jr.normal(key, bridge.noise_shape, bridge.x0.dtype)
 
 
-def _batches(key: PRNGKeyArray, num_particles: int, batch_size: int) -> list[PRNGKeyArray]:
+def _batches(
+    key: PRNGKeyArray, num_particles: int, batch_size: int, mesh: Mesh | None
+) -> tuple[list[PRNGKeyArray], Mesh | None]:
+    """Keys of what runs at once, and the devices that share each batch of them."""
+    mesh = mesh_for(num_particles, "`num_particles`", mesh)
+    at_once = batch_size * (1 if mesh is None else mesh.size)
     keys = jr.split(key, num_particles)
-    return [keys[i : i + batch_size] for i in range(0, num_particles, batch_size)]
+    return [keys[i : i + at_once] for i in range(0, num_particles, at_once)], mesh
 
 
 @eqx.filter_jit
-def _log_weights(bridge: GuidedBridge, keys):
-    return jax.vmap(lambda key: bridge.log_weight(driving_noise(bridge, key)))(keys)
+def _log_weights(bridge: GuidedBridge, keys, mesh: Mesh | None = None):
+    def log_weight(key):
+        return bridge.log_weight(driving_noise(bridge, key))
+
+    return spread(log_weight, mesh)(keys)
 
 
 def _rounding(bridge: GuidedBridge, log_evidence: float) -> float:

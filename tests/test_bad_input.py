@@ -137,6 +137,7 @@ OBJECTS = {
     "specimen": SPECIMEN,
     "tree": TREE,
     "optimizer": optax.sgd(0.1),
+    "mesh": jax.sharding.Mesh(np.array(jax.devices()[:1]), "devices"),
 }
 """One object of each kind; what is asked for is replaced by any of the others, or by its class."""
 
@@ -395,6 +396,16 @@ def table() -> dict[str, Row]:
             key=("key", KEY),
             num_particles=("count from 2", 4),
             batch_size=("count", 4),
+            mesh="mesh?",
+        ),
+        "spread": row(
+            nb.spread,
+            False,
+            lambda spread: spread(X),
+            fn=("function", lambda x: 2 * x),
+            mesh="mesh?",
+            axis="name?",
+            batch_size=("count?", 1),
         ),
         "estimate_tree_evidence": row(
             nb.estimate_tree_evidence, True, law=("law", LAW), data=("array", X), key=("key", KEY), settings="free"
@@ -412,6 +423,7 @@ def table() -> dict[str, Row]:
             num_moves=("count", 1),
             batch_size=("count", 4),
             progress=("flag", False),
+            mesh="mesh?",
         ),
         "compare": row(
             nb.compare,
@@ -422,6 +434,7 @@ def table() -> dict[str, Row]:
             batch_size="count?",
             training_seconds="mapping?",
             score="function?",
+            mesh="mesh?",
         ),
         "Comparison.of": row(
             nb.Comparison.of,
@@ -501,7 +514,7 @@ def table() -> dict[str, Row]:
         ),
         # inference
         "infer.run_checkpointed": row(
-            lambda mcmc, path, rng_key, interval=100, keep_noise=None, extra_fields=(), **kwargs: (
+            lambda mcmc, path, rng_key, interval=100, keep_noise=None, extra_fields=(), mesh=None, **kwargs: (
                 infer.run_checkpointed(
                     mcmc,
                     path,
@@ -509,6 +522,7 @@ def table() -> dict[str, Row]:
                     interval=interval,
                     keep_noise=keep_noise,
                     extra_fields=extra_fields,
+                    mesh=mesh,
                 )
             ),
             True,
@@ -520,6 +534,7 @@ def table() -> dict[str, Row]:
             keep_noise="count?",
             extra_fields="names",
             init_params="free",
+            mesh="mesh?",
             kwargs="free",
         ),
         "to_arviz": row(
@@ -551,6 +566,7 @@ def table() -> dict[str, Row]:
             jitter=("setting", 0.2),
             max_num_steps=("count", 8),
             init_strategy="function",
+            mesh="mesh?",
         ),
         **{
             f"infer.{kernel.__name__}": row(
@@ -565,6 +581,7 @@ def table() -> dict[str, Row]:
                 adapt_angle=("flag", True),
                 target_accept_prob=("setting", 0.4),
                 init_strategy="function",
+                mesh="mesh?",
                 **({"settings": "free"} if kernel is infer.PCNL else {}),
             )
             for kernel in (infer.PCN, infer.PCNL)
@@ -580,6 +597,7 @@ def table() -> dict[str, Row]:
                 step_size=("setting?", 0.5),
                 max_particles=("count", 8),
                 init_strategy="function",
+                mesh="mesh?",
             )
             for kernel in (infer.CorrelatedPseudoMarginal, infer.CorrelatedPseudoMarginalMALA)
         },
@@ -663,6 +681,7 @@ def table() -> dict[str, Row]:
             directory="path?",
             progress=("flag", False),
             watch="function?",
+            mesh="mesh?",
             **GUIDED | {"num_steps": ("count?", 2)},
         ),
         # data and drawings

@@ -363,6 +363,9 @@ ERRORS = {
     "`match` must have a Gaussian error where nodes have several rows": lambda: nb.DiffusionTree(
         LINEAR, VECTOR, nb.StudentMatch(0.1, 3.0), tree=TREE.observing(["a", "a", "b"])
     ),
+    "cannot be learned": lambda: nb.scores.fit(
+        BROWNIAN, nb.VarifoldMatch(0.1, 0.5).at(SQUARE), x0=SQUARE, t1=1.0, num_steps=2, key=jr.key(0)
+    ),
     "`guided_terms` are of the bridge `flat`": lambda: bridge_to(
         nb.VarifoldMatch(0.1, 0.5), SQUARE, SQUARE
     ).guided_terms(np.zeros((2, 4, 2))),

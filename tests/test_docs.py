@@ -4,6 +4,7 @@ import inspect
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 import tomllib
@@ -50,24 +51,44 @@ def test_code_runs_as_it_stands(names, tmp_path):
     Two processes share the blocks. The README's first page is run by test_examples.py.
     """
     pages = [ROOT / "docs" / name for name in names]
+    printed = printed_by([({}, first, "2", *pages) for first in "01"], tmp_path)
+    blocks = sum(page.read_text(encoding="utf-8").count("\n```python\n") for page in pages)
+    assert blocks >= 3 and printed.count("ran the block") == blocks
+
+
+@pytest.mark.slow
+def test_code_runs_on_many_devices(tmp_path):
+    """The first block on 8 devices of one process, the second in two processes."""
+    page = ROOT / "docs" / "devices.md"
+    assert page.read_text(encoding="utf-8").count("\n```python\n") == 2
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        told = {"COORDINATOR": f"localhost:{free.getsockname()[1]}", "NUM_PROCESSES": "2"}
+    processes = [(told | {"PROCESS_ID": rank}, "1", "2", page) for rank in "01"]
+    printed = printed_by([({}, "0", "2", page), *processes], tmp_path)
+    assert printed.count("ran the block") == 3 and printed.count("drift") == 1
+    assert "log evidence" in printed and "'devices': 4" in printed
+
+
+def printed_by(calls, folder) -> str:
+    """What the processes print that run blocks of pages, each with an environment of its own."""
     quick = {"OPENBLAS_NUM_THREADS": "1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "PYTHONPATH": str(ROOT)}
     told = "ignore:residual brought nothing:UserWarning"  # of a page's few updates, which says so
     program = [sys.executable, "-W", "error::UserWarning", "-W", told, "-c", RUN_BLOCKS]
     running = [
         subprocess.Popen(
-            [*program, first, "2", *map(str, pages)],
-            cwd=tmp_path,
-            env=os.environ | quick,
+            [*program, *map(str, arguments)],
+            cwd=folder,
+            env=os.environ | quick | own,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
         )
-        for first in ("0", "1")
+        for own, *arguments in calls
     ]
     printed = [process.communicate(timeout=300)[0] for process in running]
-    assert [process.returncode for process in running] == [0, 0], "\n".join(printed)
-    blocks = sum(page.read_text(encoding="utf-8").count("\n```python\n") for page in pages)
-    assert blocks >= 3 and "".join(printed).count("ran the block") == blocks
+    assert [process.returncode for process in running] == [0] * len(calls), "\n".join(printed)
+    return "".join(printed)
 
 
 @pytest.mark.slow

@@ -1,10 +1,6 @@
 """The MCMC kernels: exact, in NumPyro's contract, and with an acceptance that does not depend on the grid."""
 
-import os
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -340,28 +336,6 @@ def test_chain_methods_and_pickling():
     assert pickle.loads(pickle.dumps(mcmc)).get_samples()["mean"].shape == (40,)
 
 
-def four_chains():
-    """Draws of a mean, and the number of devices that hold them."""
-    mcmc = run(FunctionSpaceHMC(conjugate), DATA, num_warmup=10, num_samples=5)
-    mean = mcmc.get_samples(group_by_chain=True)["mean"]
-    return [len(mean.sharding.device_set), *np.ravel(mean)]
-
-
-def test_chains_on_two_devices():
-    """Half of them on each, and the draws are those of one device."""
-    settings = {
-        "XLA_FLAGS": os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2",
-        "JAX_ENABLE_X64": "1",
-        "PYTHONPATH": str(Path(nb.__file__).parents[1]),
-    }
-    command = [sys.executable, __file__]
-    done = subprocess.run(command, env=os.environ | settings, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    (devices, *found), (_, *expected) = map(float, done.stdout.split()), four_chains()
-    assert devices == 2
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
 def test_chains_start_near_the_mode():
     """The Laplace approximation of a normal posterior is that posterior: no transient is left to the warm-up."""
     state = FunctionSpaceHMC(conjugate).init(jr.split(jr.key(0), 200), 0, None, (DATA,), {})
@@ -369,7 +343,3 @@ def test_chains_start_near_the_mode():
     start = np.asarray(state.z["mean"])
     assert abs(start.mean() - mean) < 0.5 * sd and 0.8 < start.std() / sd < 1.25
     assert np.all(np.asarray(state.z["wing_noise"]) == 0)
-
-
-if __name__ == "__main__":
-    print(*four_chains())

@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 # A module imports from the rows above its own, never from its neighbours. Nobody imports the last row.
 LAYERS = [
     {"_types", "_checks", "_files"},
-    {"_linalg", "weights", "io"},
+    {"_devices", "_linalg", "weights", "io"},
     {"_closed", "spaces", "kernels", "shapes"},
     {"sdes"},
     {"conditioning"},

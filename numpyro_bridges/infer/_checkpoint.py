@@ -23,12 +23,14 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jax.sharding import Mesh
 from jax.tree_util import keystr, tree_flatten_with_path
 from numpyro.infer import MCMC
 from numpyro.util import is_prng_key, nested_attrgetter
 from tqdm.auto import tqdm
 
 from .._checks import as_path, positive_integer, require, require_instance, require_key, words
+from .._devices import gather, is_writer, mesh_for, spread, wait_for_all
 from .._files import write_whole
 from ._posterior import noise_sites, sites_of
 
@@ -43,6 +45,7 @@ def run_checkpointed(
     keep_noise: int | None = None,
     extra_fields=(),
     init_params=None,
+    mesh: Mesh | None = None,
     **kwargs,
 ) -> None:
     """`mcmc.run(rng_key, *args, ...)` in intervals that are saved; where a run was cut off, it goes on from there.
@@ -59,6 +62,9 @@ def run_checkpointed(
     - `path`: a directory, made if need be, for this run alone and for one process at a time.
     - `rng_key`, `args`, `kwargs`, `extra_fields`, `init_params`: as for `run`.
     - `interval`: the number of iterations, warm-up included, between two savings: at most as many are lost to a kill.
+    - `mesh`: the devices that share the chains, as for `numpyro_bridges.spread`, of any kernel and in place of
+      `chain_method`. On another mesh a run goes on to rounding, not bit for bit. The processes of a mesh of several
+      call this together, with one `path` that all of them see; the first writes.
     - `keep_noise`: by default the driving noise of the draws is dropped. With k > 1 every k-th draw's is kept, in
       `mcmc.get_extra_fields()["noise"]`, for the bridges of `to_arviz`; with 1 it stays among the samples.
 
@@ -77,7 +83,12 @@ def run_checkpointed(
     require(mcmc.post_warmup_state is None, "`mcmc` must do its own warm-up: set `mcmc.post_warmup_state` to None.")
     folder = as_path(path, "path")
     require(folder.is_dir() or not folder.exists(), f"`path` must be a directory, or a new name; {folder} is a file.")
-    chains = _Chains(mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval)
+    require(
+        mesh is None or mcmc.num_chains > 1,
+        f"`mesh` is for several chains, and `mcmc` has {mcmc.num_chains}: `MCMC(..., num_chains=8)`.",
+    )
+    mesh_for(mcmc.num_chains, "`num_chains` of `mcmc`", mesh)
+    chains = _Chains(mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh)
     state, done = _load_state(folder, chains)
     total = mcmc.num_warmup + mcmc.num_samples
     require(
@@ -92,9 +103,10 @@ def run_checkpointed(
             while done < total:
                 stop = min((done // interval + 1) * interval, total)
                 state, draws = chains.advance(state, done, stop)
-                if draws:
-                    _write(_draws_file(folder, done), draws)
-                _write(folder / "state.npz", chains.record(state, stop))
+                if is_writer(chains.mesh):
+                    if draws:
+                        _write(_draws_file(folder, done), draws)
+                    _write(folder / "state.npz", chains.record(state, stop))
                 divergences += np.sum(draws.get("diverging", 0))
                 bar.update(stop - done)
                 done = stop
@@ -111,13 +123,14 @@ def run_checkpointed(
             file=sys.stderr,
         )
         raise
+    wait_for_all(chains.mesh, "the draws are written")
     _hand_over(folder, chains, state, done)
 
 
 class _Chains:
     """The chains of an `MCMC`, advanced by any number of iterations with one compiled program."""
 
-    def __init__(self, mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval):
+    def __init__(self, mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh):
         self.mcmc, self.args, self.kwargs, self.interval = mcmc, args, kwargs, interval
         self.sampler = copy.copy(mcmc.sampler)  # `init` leaves functions in it
         names = dict.fromkeys([mcmc._sample_field, *mcmc._default_fields, *extra_fields])
@@ -125,25 +138,27 @@ class _Chains:
         self.removed = {name.removeprefix(f"~{mcmc._sample_field}.") for name in names if name.startswith("~")}
         self.noise = () if keep_noise == 1 else _noise_of(self.sampler, args, kwargs)
         self.keep_noise = keep_noise
-        self.batched = mcmc.num_chains > 1 and mcmc.chain_method == "vectorized"
+        self.batched = mcmc.num_chains > 1 and mcmc.chain_method == "vectorized" and mesh is None
+        self.mesh = mesh or getattr(mcmc.sampler, "_mesh", None)
 
         keys = jr.split(rng_key, mcmc.num_chains) if mcmc.num_chains > 1 and is_prng_key(rng_key) else rng_key
-        init = _over_chains(mcmc, lambda x, _: self.sampler.init(x[0], mcmc.num_warmup, x[1], args, kwargs))
+        init = _over_chains(mcmc, mesh, lambda x, _: self.sampler.init(x[0], mcmc.num_warmup, x[1], args, kwargs))
         start = jax.tree.map(_array, init((keys, jax.tree.map(jnp.asarray, init_params)), ()))
-        self.start = _rebuilt(_named(_plain(start)), start)
+        self.start = _rebuilt(_named(gather(_plain(start))), start)
         for name in self.fields:
             _require_field(self._first(self.start), name)
         leaves = jax.tree.leaves(_plain(self.start))
         self.fingerprint = np.array([np.sum(np.abs(x), dtype=float) for x in leaves])
         self.draw = jax.eval_shape(self._collect, self.start if self.batched else self._first(self.start))
-        self._program = _over_chains(mcmc, self._advance, jax.jit)
+        self._program = _over_chains(mcmc, mesh, self._advance, jax.jit)
 
+        method = "mesh" if mesh else getattr(mcmc.chain_method, "__name__", mcmc.chain_method)
         inputs = {"rng_key": rng_key, "args": args, "kwargs": kwargs, "init_params": init_params}
         shapes = _named({"draw": self.draw, "state": self.start})
         self.settings = {
             "num_warmup": mcmc.num_warmup,
             "num_chains": mcmc.num_chains,
-            "chain_method": getattr(mcmc.chain_method, "__name__", mcmc.chain_method) if mcmc.num_chains > 1 else None,
+            "chain_method": method if mcmc.num_chains > 1 else None,
             "thinning": mcmc.thinning,
             "interval": interval,
             "keep_noise": keep_noise,
@@ -156,12 +171,13 @@ class _Chains:
     def advance(self, state, begin, end):
         """The state after iteration `end`, and what is kept since `begin`: arrays `(chains, draws, ...)` by name."""
         state, draws = self._program(state, (begin, end))
+        named, draws = gather((_named(_plain(state)), draws))
         kept = {}
         for name, x in draws.items():
             x = np.asarray(x)
             x = x.swapaxes(0, 1) if self.batched else x[None] if self.mcmc.num_chains == 1 else x
             kept[name] = x[:, : self.count(name, end) - self.count(name, begin)]
-        return _rebuilt(_named(_plain(state)), self.start), kept if any(x.size for x in kept.values()) else {}
+        return _rebuilt(named, self.start), kept if any(x.size for x in kept.values()) else {}
 
     def record(self, state, done):
         """What `state.npz` holds."""
@@ -213,13 +229,13 @@ class _Chains:
         return jax.lax.fori_loop(begin, end, step, (state, draws))
 
 
-def _over_chains(mcmc, fn, jit=lambda fn: fn):
-    """`fn(x, common)`, x being of one chain, for all chains by the method of `mcmc`."""
+def _over_chains(mcmc, mesh, fn, jit=lambda fn: fn):
+    """`fn(x, common)`, x being of one chain, for all chains: on the devices of a mesh, or by the method of `mcmc`."""
     method = mcmc.chain_method
-    if mcmc.num_chains == 1 or method == "vectorized":
+    if mesh is None and (mcmc.num_chains == 1 or method == "vectorized"):
         return jit(fn)
-    if method == "parallel":
-        return jax.pmap(fn, in_axes=(0, None))
+    if mesh is not None or method == "parallel":
+        jit, method = jax.jit, partial(spread, mesh=mesh)
     if not isinstance(method, str):
         return jit(lambda x, common: method(lambda x: fn(x, common))(x))
     one, stack = jit(fn), partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))

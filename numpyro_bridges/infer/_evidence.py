@@ -16,6 +16,7 @@ takes them as given. Two estimates of log Z(1), in opposite directions:
 
 import math
 from contextlib import ExitStack
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -27,11 +28,13 @@ import numpyro
 import numpyro.distributions as dist
 from jax import Array
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh
 from numpyro import handlers
 from numpyro.distributions import biject_to
 from tqdm.auto import tqdm
 
 from .._checks import choice, flag, positive_integer, require, require_instance, require_key, require_mapping
+from .._devices import gather, mesh_for, spread
 from ..distributions import AbstractNoiseDriven, sample
 from ..weights import log_mean_exp
 from ._posterior import Sites, is_latent, is_noise, prior_and_likelihood, sites_of
@@ -117,7 +120,7 @@ def estimate_tree_evidence(law: AbstractNoiseDriven, data, key: Array, **setting
     **Returns:** a `TemperedEvidence`.
     """
     require_instance(law, AbstractNoiseDriven, "law", "a law with driving noise, such as `DiffusionTree`")
-    require(data is not None, "`data` must be what the law observes; got None, of which nothing is seen.")
+    require(data is not None, "`data` must be an array shaped as `law`; got None, which would be no data.")
     return estimate_model_evidence(_observed, key, law, data, **settings)
 
 
@@ -139,6 +142,7 @@ def estimate_model_evidence(
     num_moves: int = 3,
     batch_size: int = 16,
     progress: bool = True,
+    mesh: Mesh | None = None,
 ) -> TemperedEvidence:
     """Estimate p(data) of a NumPyro model with driving noise, its parameters integrated over their priors.
 
@@ -151,8 +155,9 @@ def estimate_model_evidence(
     - `num_islands`: independent repetitions, at least 2, or chains. More of them tell the standard error better; more
       particles make each estimate better.
     - `num_moves`: trajectories of each particle at each temperature, in "smc".
-    - `batch_size`: particles that are evaluated at once; memory is bounded by it.
+    - `batch_size`: particles that a device evaluates at once; memory is bounded by it.
     - `progress`: show a bar.
+    - `mesh`: the devices that share the particles of an island, or the chains, as for `spread`.
 
     **Returns:** a `TemperedEvidence`; NaN where the log density of a draw from the prior is NaN.
 
@@ -168,7 +173,10 @@ def estimate_model_evidence(
     num_moves = positive_integer(num_moves, "num_moves")
     batch_size = positive_integer(batch_size, "batch_size")
     progress = flag(progress, "progress")
-    run = _Run(model, model_args, model_kwargs or {}, batch_size)
+    mesh_for(num_particles, "`num_particles`", mesh)
+    if method == "bridge":
+        mesh_for(num_islands, "`num_islands`", mesh)
+    run = _Run(model, model_args, model_kwargs or {}, batch_size, mesh)
     key_pilot, key = jr.split(key)
     with tqdm(desc="temperatures", disable=not progress) as bar:
         particles, stages, rates = _pilot(run, key_pilot, num_particles, num_moves, bar)
@@ -201,15 +209,16 @@ class _Stage(NamedTuple):
 class _Run:
     """The programs of one model."""
 
-    def __init__(self, model, model_args, model_kwargs, batch_size: int):
+    def __init__(self, model, model_args, model_kwargs, batch_size: int, mesh: Mesh | None):
         self._model, self._args, self._kwargs = model, model_args, model_kwargs
         sites = {name: site for name, site in sites_of(model, model_args, model_kwargs).items() if is_latent(site)}
         _check_sites(sites)
         self._noise = {name for name, site in sites.items() if is_noise(site)}
         self._unravel = self._parts(_unconstrained(sites))[2]
-        self._batch_size = batch_size
-        self.start = jax.jit(self._start)
-        self.move = jax.jit(self._move, static_argnames="num_moves")
+        self._spread = partial(spread, mesh=mesh, batch_size=batch_size)
+        start, move = jax.jit(self._start), jax.jit(self._move, static_argnames="num_moves")
+        self.start = lambda keys: gather(start(keys))
+        self.move = lambda *args: gather(move(*args))
         self.resample = jax.jit(_resampled)
         self.fitted = jax.jit(self._fitted)
 
@@ -240,19 +249,17 @@ class _Run:
             z = _unconstrained({name: site for name, site in trace.items() if is_latent(site)})
             return _Particles(z, self._evaluate(z)[1])
 
-        return jax.lax.map(one, keys, batch_size=self._batch_size)
+        return self._spread(one)(keys)
 
     def _move(self, particles: _Particles, key, stage: _Stage, num_moves: int):
-        """Every particle moved on its own: where it is, the mean acceptance, and log p(v | θ, z) after each move."""
+        """Every particle moved on its own: where it is, its mean acceptance, and log p(v | θ, z) after each move."""
 
         reference = stage.reference
 
         def to_sites(x):
             return self._unravel(reference.colour(x[0])) | x[1]
 
-        def one(inputs):
-            particle, key = inputs
-
+        def one(particle, key):
             def psi(x):
                 prior, log_likelihood = self._evaluate(to_sites(x))
                 return prior - half_square(x[0]) - stage.beta * log_likelihood, log_likelihood
@@ -282,8 +289,7 @@ class _Run:
             return _Particles(to_sites(x), value[1]), jnp.mean(rates[1:]), history[1:]
 
         keys = jr.split(key, len(particles.log_likelihood))
-        moved, rates, history = jax.lax.map(one, (particles, keys), batch_size=self._batch_size)
-        return moved, jnp.mean(rates), history
+        return self._spread(one)(particles, keys)
 
 
 def _unconstrained(sites) -> Sites:
@@ -323,10 +329,11 @@ def _pilot(run: _Run, key, num_particles, num_moves, bar):
         particles, _ = run.resample(particles, key_resample, new - beta)
         beta = new
         stage = _Stage(jnp.asarray(beta), jnp.asarray(_num_steps(step)), run.fitted(particles.z))
-        particles, rate, _ = run.move(particles, key_move, stage, num_moves)
+        particles, accepted, _ = run.move(particles, key_move, stage, num_moves)
+        rate = float(jnp.mean(accepted))
         step = float(np.clip(step * np.exp(2 * (rate - _ACCEPTANCE)), _LENGTH / _MAX_STEPS, _LENGTH))
         stages.append(stage._replace(num_steps=jnp.asarray(_num_steps(step))))
-        rates.append(float(rate))
+        rates.append(rate)
         bar.set_postfix(pilot=f"{beta:.3g}")
         bar.update()
     return particles, stages, rates

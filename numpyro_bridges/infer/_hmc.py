@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 from jax import Array
+from jax.sharding import Mesh
 
 from .._checks import flag, known_number, positive_integer
 from ._kernel import POSITIVE, PROPORTION, PROPORTION_OR_0, UNSEALED, AbstractBridgeKernel
@@ -77,6 +78,7 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
     - `max_num_steps`: bounds that number, adapted or not. The trajectory keeps its length.
     - `init_strategy`: the noise starts at zero, the guided mean path; parameters at their prior medians, from where the
       Laplace approximation is sought. Chains start at draws from it, or at `init_params`.
+    - `mesh`: the devices that share the chains of `chain_method="vectorized"`, as for `numpyro_bridges.spread`.
     """
 
     def __init__(
@@ -90,8 +92,9 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         jitter: float = 0.2,
         max_num_steps: int = 32,
         init_strategy=init_to_guided_mean,
+        mesh: Mesh | None = None,
     ):
-        super().__init__(model, init_strategy)
+        super().__init__(model, init_strategy, mesh)
         self._step_size = known_number(step_size, "step_size", *POSITIVE)
         self._target = known_number(target_accept_prob, "target_accept_prob", *PROPORTION)
         self._adapt_step_size = flag(adapt_step_size, "adapt_step_size")

@@ -1,7 +1,6 @@
 """What the kernels share: they are NumPyro kernels of a model whose noise carries the `driving_noise` mark."""
 
 import copy
-import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import partial
@@ -13,7 +12,7 @@ import jax.random as jr
 import numpy as np
 import numpyro
 from jax.flatten_util import ravel_pytree
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 from numpyro.distributions import biject_to
 from numpyro.infer import init_to_sample
 from numpyro.infer.gibbs import GIBBS_SITES_KWARG
@@ -22,6 +21,7 @@ from numpyro.infer.util import constrain_fn
 from numpyro.util import is_prng_key
 
 from .._checks import as_float, concrete, require, words
+from .._devices import mesh_for, require_mesh, spread
 from ..distributions import NoiseBlocks
 from ._posterior import (
     Sites,
@@ -49,14 +49,16 @@ UNSEALED: Any = np.uint32(0)  # of a state that is being made
 class AbstractBridgeKernel(MCMCKernel):
     """A kernel of a model, written for one chain and mapped over several. Values in its state are unconstrained."""
 
-    def __init__(self, model, init_strategy=init_to_guided_mean):
+    def __init__(self, model, init_strategy=init_to_guided_mean, mesh: Mesh | None = None):
         require(callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}.")
         require(
             callable(init_strategy),
             f"`init_strategy` must be a strategy such as `init_to_median`; got {words(init_strategy)}.",
         )
+        require_mesh(mesh)
         self._model = model
         self._init_strategy = init_strategy
+        self._mesh = mesh
         self._sample_fn = None
         self._noise: tuple[str, ...] = ()
         self._blocks: dict[str, NoiseBlocks | None] = {}
@@ -108,7 +110,15 @@ class AbstractBridgeKernel(MCMCKernel):
             state = self._init_one(key, z, reference, model_args, model_kwargs)
             return _sealed(state, _seal_of(model_args, model_kwargs))
 
-        over_chains = (lambda fn: fn) if num_chains is None else partial(_over_chains, num_chains=num_chains)
+        if num_chains is not None:
+            over_chains = partial(spread, mesh=mesh_for(num_chains, "`num_chains`", self._mesh))
+        else:
+            require(
+                self._mesh is None,
+                "`mesh` is for chains that run at once, and this is one: `MCMC(kernel, num_chains=8, "
+                'chain_method="vectorized")`. In `Gibbs`, and for `run_checkpointed`, leave it out of the kernel.',
+            )
+            over_chains = lambda fn: fn  # noqa: E731
 
         def sample(state, model_args, model_kwargs):
             seal = _seal_of(model_args, model_kwargs)
@@ -280,15 +290,3 @@ def _starts(values, sites, constrained: bool, num_chains: int | None) -> Sites:
         )
         starts[name] = transform.inv(x) if constrained else x
     return starts
-
-
-def _over_chains(fn, num_chains: int):
-    """`fn` of one chain, for all of them: vectorised, in equal shares on as many of the devices as that allows.
-
-    Each device has a loop of its own: none waits for another's longer trajectory.
-    """
-    devices = jax.local_devices()[: math.gcd(num_chains, jax.local_device_count())]
-    if len(devices) == 1:
-        return jax.vmap(fn)
-    mesh, chains = Mesh(np.array(devices), "chains"), PartitionSpec("chains")
-    return jax.shard_map(jax.vmap(fn), mesh=mesh, in_specs=chains, out_specs=chains, check_vma=False)

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 from jax import Array
+from jax.sharding import Mesh
 
 from .._checks import choice, flag, known_number, positive_integer, require
 from ..distributions import NoiseBlocks
@@ -70,8 +71,9 @@ class AbstractPCN(AbstractBridgeKernel):
         adapt_angle: bool = True,
         target_accept_prob: float = 0.4,
         init_strategy=init_to_guided_mean,
+        mesh: Mesh | None = None,
     ):
-        super().__init__(model, init_strategy)
+        super().__init__(model, init_strategy, mesh)
         # In single precision π/2 is above π/2.
         self._angle = known_number(angle, "angle", "in (0, π/2]", lambda x: 0 < x < pi / 2 + 1e-6)
         self._target = known_number(target_accept_prob, "target_accept_prob", *PROPORTION)
@@ -223,6 +225,7 @@ class PCN(AbstractPCN):
       it, and has its own angle. "clade": all noise below them turns too. Without it the tree is accepted as a whole.
     - `angle`: φ in (0, π/2], π/2 being an independent proposal. Adapted in the warm-up, for each datum on its own, to
       `target_accept_prob`, unless `adapt_angle=False`.
+    - `mesh`: as for `FunctionSpaceHMC`; not inside `Gibbs`.
     """
 
     def _evaluate(self, z, model_args, model_kwargs):

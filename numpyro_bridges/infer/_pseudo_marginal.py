@@ -22,6 +22,7 @@ import jax.random as jr
 import numpy as np
 from jax import Array
 from jax.scipy.special import logsumexp
+from jax.sharding import Mesh
 
 from .. import weights
 from .._checks import concrete, known_number, positive_integer, require
@@ -67,8 +68,9 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         step_size: float | None = None,
         max_particles: int = 64,
         init_strategy=init_to_guided_mean,
+        mesh: Mesh | None = None,
     ):
-        super().__init__(model, init_strategy)
+        super().__init__(model, init_strategy, mesh)
         self._turn = math.acos(known_number(correlation, "correlation", *PROPORTION_OR_0))
         self._step_size = step_size
         if step_size is not None:
@@ -227,7 +229,7 @@ class CorrelatedPseudoMarginal(AbstractPseudoMarginal):
     - `correlation`: ρ, of the noise of successive proposals.
     - `step_size`: of the walk, in units of the parameters' reference, a Laplace approximation that is renewed in the
       warm-up. By default 2.56 / √d for d parameters (Sherlock, Thiery, Roberts and Rosenthal, 2015).
-    - `init_strategy`: as for `FunctionSpaceHMC`.
+    - `init_strategy`, `mesh`: as for `FunctionSpaceHMC`.
 
     The noise of the posterior is that of one particle for each datum: paths can be had from it as from any kernel.
     """

@@ -18,11 +18,13 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, PRNGKeyArray
 from numpy.typing import ArrayLike
 
 from .. import weights
 from .._checks import as_path, choice, concrete, flag, require, require_instance, require_key, words
+from .._devices import gather, mesh_for, spread
 from .._linalg import apply, full_precision
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
@@ -47,6 +49,12 @@ class Problem(NamedTuple):
     guide: ScoreGuide
     training: Training
     train: Callable
+    mesh: Mesh | None = None
+
+    def spread(self, fn: Callable, size: int) -> Callable:
+        """`fn` for a batch of a size; whole on each device where that has no equal shares."""
+        whole = self.mesh is not None and size % self.mesh.size > 0
+        return jax.vmap(fn) if whole else spread(fn, self.mesh)
 
 
 @full_precision
@@ -69,6 +77,7 @@ def fit(
     directory: str | Path | None = None,
     progress: bool = True,
     watch: Callable[[str, ScoreGuide], None] | None = None,
+    mesh: Mesh | None = None,
 ) -> ScoreGuide:
     """Trains a network that corrects a guide, so that guide and network together are ∇log h.
 
@@ -96,6 +105,9 @@ def fit(
     - `progress`: show a bar with the loss, the evidence bound and the ESS on held-out paths.
     - `watch`: `watch(name, guide)` is called at each look, with the guide as it then is and the history so far; `name`
       is the method's, or `"time reversal"` in the first pass of `"reversal"`.
+    - `mesh`: the devices that share a batch and the held-out paths, as for `numpyro_bridges.spread`. With `draw` the
+      problems of a batch are shared, where there are equal shares of them. Of a cloud, of `"adjoint"` and `"reversal"`
+      without `draw`, they share the network's work, and each makes the cloud.
 
     **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
     training with a warning.
@@ -105,6 +117,11 @@ def fit(
     if ts is None and num_steps is None:
         num_steps = 100
     bridge = GuidedBridge(sde, condition, x0=x0, t1=t1, t0=t0, num_steps=num_steps, ts=ts, guide=guide)
+    require(
+        bridge.flat is None,
+        "`condition` is known by its density, for which states of several columns are flattened: a network of such states "
+        "cannot be learned. Fit one for an `InexactMatch` near it, or use the default guide.",
+    )
     training = Training() if training is None else training
     require_instance(training, Training, "training", "a `Training(...)`")
     for name, function, meant in (
@@ -116,6 +133,8 @@ def fit(
         good = function is None or callable(function)
         require(good, f"`{name}` must be a function {meant}; got {words(function)}.")
     progress = flag(progress, "progress")
+    for name in ("batch_size", "held_out"):
+        mesh_for(getattr(training, name), f"`{name}` of `training`", mesh)
     folder = None if directory is None else as_path(directory, "directory")
     key_network, key_pilot, key_train = jr.split(key, 3)
 
@@ -143,7 +162,9 @@ def fit(
             directory=folder,
             progress=progress,
             watch=watch,
+            mesh=mesh,
         ),
+        mesh,
     )
     return METHODS[method](problem, key_train)
 
@@ -161,7 +182,8 @@ def residual(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
             noise = jr.normal(key_noise, bridge.noise_shape, bridge.x0.dtype)
             return -bridge.with_guide(guide).log_weight(noise)
 
-        return jnp.mean(jax.vmap(one)(jr.split(key, problem.training.batch_size))), network
+        size = problem.training.batch_size
+        return jnp.mean(problem.spread(one, size)(jr.split(key, size))), network
 
     return problem.train(problem, loss, _judge(problem, key_judge), key, "residual")
 
@@ -241,15 +263,18 @@ def _driftless(bridge: GuidedBridge) -> AbstractGuide:
 METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
 
 
-def _train(problem: Problem, loss, judge, key, name, *, given, directory, progress, watch) -> ScoreGuide:
+def _train(problem: Problem, loss, judge, key, name, *, given, directory, progress, watch, mesh) -> ScoreGuide:
     def guide(network, history):
         return replace(problem.guide, network=network, history=history)
+
+    def judged(network):
+        return gather(judge(network))
 
     file = None if directory is None else directory / f"{name.replace(' ', '_')}.eqx"
     network, history = train(
         problem.guide.network,
         loss,
-        judge,
+        judged,
         key,
         problem.training,
         name=name,
@@ -257,8 +282,9 @@ def _train(problem: Problem, loss, judge, key, name, *, given, directory, progre
         problem=(given, problem.guide.standard),
         progress=progress,
         watch=None if watch is None else lambda network, history: watch(name, guide(network, history)),
+        mesh=mesh,
     )
-    return guide(network, history | _gain(name, judge(problem.guide.network), judge(network)))
+    return guide(network, history | _gain(name, judged(problem.guide.network), judged(network)))
 
 
 def _gain(name: str, before, after) -> dict[str, Array]:
@@ -344,15 +370,16 @@ def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
     def loss(network, key):
         if draws == 1:
             inputs, error = rows(network, key)
-            t, x, *fixed = inputs
-            output, network = over_batch(network, t.ravel(), x.reshape(t.size, *x.shape[2:]), *fixed)
+            t, x, v, theta = inputs
+            states = x.reshape(t.size, *x.shape[2:])
+            output, network = over_batch(network, t.ravel(), states, v, theta, problem.spread)
             return error(output.reshape(*t.shape, *output.shape[1:])), network
 
         def one(key):
             inputs, error = rows(network, key)
             return error(jax.vmap(jax.vmap(network, ROWWISE), ROWWISE)(*inputs))
 
-        return jnp.mean(jax.vmap(one)(jr.split(key, draws))), network
+        return jnp.mean(problem.spread(one, draws)(jr.split(key, draws))), network
 
     return loss
 
@@ -365,6 +392,9 @@ def _judge(problem: Problem, key: PRNGKeyArray):
     """
     draws = 16 if problem.amortised else 1
     half = -(-problem.training.held_out // (2 * draws))
+    over_paths, over_draws = partial(problem.spread, size=2 * half), jax.vmap
+    if problem.amortised:
+        over_paths, over_draws = jax.vmap, partial(problem.spread, size=draws)
 
     @eqx.filter_jit
     def judge(network):
@@ -372,16 +402,16 @@ def _judge(problem: Problem, key: PRNGKeyArray):
             key_draw, key_noise = jr.split(key)
             bridge = problem.draw(key_draw).with_guide(replace(problem.guide, network=network))
             noise = jr.normal(key_noise, (half, *bridge.noise_shape), bridge.x0.dtype)
-            log_weights = jax.vmap(bridge.log_weight)(jnp.concatenate([noise, -noise]))
+            log_weights = over_paths(bridge.log_weight)(jnp.concatenate([noise, -noise]))
             ess = weights.effective_sample_size(log_weights) / (2 * half)
             pairs = (log_weights[:half] + log_weights[half:]) / 2
             return pairs, ess, jnp.std(log_weights)
 
-        pairs, ess, spread = jax.vmap(one)(jr.split(key, draws))
+        pairs, ess, deviation = over_draws(one)(jr.split(key, draws))
         parts = jnp.mean(pairs, axis=1) if problem.amortised else pairs[0]
         bound, ess = jnp.mean(parts), jnp.mean(ess)
         value = jnp.where(jnp.isfinite(bound), bound, -jnp.inf)
-        perfect = jnp.all(spread < jnp.sqrt(jnp.finfo(spread.dtype).eps))
+        perfect = jnp.all(deviation < jnp.sqrt(jnp.finfo(deviation.dtype).eps))
         value = jnp.where(perfect, jnp.inf, value)
         return value, bound, ess, parts
 
@@ -408,16 +438,16 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> Scor
     pooled = isinstance(bridge.sde.space, Landmarks)
     away = jnp.mean((paths - v[:, None]) ** 2, axis=(0, 1))
     if pooled:
-        centre, spread = jnp.zeros(()), jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=1, keepdims=True)) ** 2))
+        centre, width = jnp.zeros(()), jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=1, keepdims=True)) ** 2))
         away = jnp.mean(away)
     else:
-        centre, spread = jnp.mean(v, axis=0), jnp.std(v, axis=0)
-        spread = jnp.where(spread > 1e-6 * (1 + jnp.abs(centre)), spread, 1.0)
+        centre, width = jnp.mean(v, axis=0), jnp.std(v, axis=0)
+        width = jnp.where(width > 1e-6 * (1 + jnp.abs(centre)), width, 1.0)
     scale = jnp.sqrt(away)
     scale = jnp.where(scale > 1e-6 * jnp.max(scale), scale, 1.0)
     deviation = jnp.std(theta, axis=0)
     standard = Standard(
-        duration, scale, centre, spread, jnp.mean(theta, axis=0), jnp.where(deviation > 0, deviation, 1.0)
+        duration, scale, centre, width, jnp.mean(theta, axis=0), jnp.where(deviation > 0, deviation, 1.0)
     )
     return ScoreGuide(bridge.guide, network, standard, context)
 

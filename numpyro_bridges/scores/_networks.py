@@ -1,7 +1,7 @@
 """Networks `network(t, x, v, theta)`: `ScoreGuide` says what they are given. Ours start at zero, `UNet` does not."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -227,13 +227,13 @@ ROWWISE = (0, 0, None, None)
 """Axes of (t, x, v, theta): the rows of a batch share their target and context."""
 
 
-def over_batch(network, t, x, v, theta):
-    """Outputs of rows of (t, x), and the network with its state renewed."""
+def over_batch(network, t, x, v, theta, spread: Callable):
+    """Outputs of rows of (t, x), and the network with its state renewed, of all rows; `spread(fn, size)` maps."""
     if isinstance(network, WithState):
         mapped = jax.vmap(network.network, (*ROWWISE, None), (0, None), axis_name="batch")
         outputs, state = mapped(t, x, v, theta, network.state)
         return outputs, WithState(network.network, state)
-    return jax.vmap(network, ROWWISE)(t, x, v, theta), network
+    return spread(lambda t, x: network(t, x, v, theta), len(t))(t, x), network
 
 
 def _size(shape: tuple[int, int]) -> int:

@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array, PRNGKeyArray
 from tqdm.auto import tqdm
 
 from .._checks import flag, known_number, positive_integer, require, words
+from .._devices import gather, is_writer, wait_for_all
 from .._files import write_whole
 
 
@@ -127,6 +129,7 @@ def train(
     problem: Any = None,
     progress: bool = True,
     watch: Callable[[Any, dict[str, Array]], None] | None = None,
+    mesh: Mesh | None = None,
 ) -> tuple[Any, dict[str, Array]]:
     """The best network, and the history.
 
@@ -136,7 +139,8 @@ def train(
     E log w is little moved by large weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the
     same key gives the same network, however often training is resumed from `file`, which is refused where it was
     written for another `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is
-    called at each look with the network that was looked at. Seconds are of the updates, compilation apart.
+    called at each look with the network that was looked at. Seconds are of the updates, compilation apart. The file is
+    written by the first process of `mesh`, over which the loss spreads its paths.
     """
     optimizer, decay = training.optimizer, training.average
     looks = -(-training.num_updates // training.interval) + 1
@@ -213,13 +217,14 @@ def train(
         state = _load(file, state, label)
     else:
         state = look(state, jnp.nan, 0.0)
+    wait_for_all(mesh, f"{name} begins")
     compiled = advance.lower(state).compile()
     show(state)
     spent = float(np.nanmax(np.asarray(state.history["seconds"])))
     with tqdm(total=training.num_updates, initial=int(state.update), desc=name, disable=not progress) as bar:
         while int(state.update) < training.num_updates and not _stopped(state, training):
             begin = time.perf_counter()
-            new, losses = jax.block_until_ready(compiled(state))
+            new, losses = gather(jax.block_until_ready(compiled(state)))
             if not bool(jnp.all(jnp.isfinite(losses))):
                 first = int(state.update) + int(jnp.argmax(~jnp.isfinite(losses)))
                 warnings.warn(
@@ -231,7 +236,7 @@ def train(
             spent += time.perf_counter() - begin
             done = int(new.update) - int(state.update)
             state = look(new, jnp.sum(losses) / done, spent)
-            if file is not None:
+            if file is not None and is_writer(mesh):
                 _save(file, state, label)
             row = {k: float(np.asarray(v)[-1]) for k, v in rows(state).items()}
             bar.set_postfix_str(f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %")
