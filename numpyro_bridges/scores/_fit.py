@@ -119,8 +119,8 @@ def fit(
     bridge = GuidedBridge(sde, condition, x0=x0, t1=t1, t0=t0, num_steps=num_steps, ts=ts, guide=guide)
     require(
         bridge.flat is None,
-        "`condition` is known by its density, for which states of several columns are flattened: a network of such states "
-        "cannot be learned. Fit one for an `InexactMatch` near it, or use the default guide.",
+        "`condition` is known by its density, for which states of several columns are flattened: a network of "
+        "such states cannot be learned. Fit one for an `InexactMatch` near it, or use the default guide.",
     )
     training = Training() if training is None else training
     require_instance(training, Training, "training", "a `Training(...)`")
