@@ -67,9 +67,7 @@ SIZES = {"num_warmup": 3, "num_samples": 3, "num_chains": 8, "progress_bar": Fal
 
 def vectorised(mesh, folder):
     """By default on all devices of a process."""
-    if mesh is not None and not mesh.is_multi_process:
-        mesh = None
-    mcmc = MCMC(FunctionSpaceHMC(model, mesh=mesh), chain_method="vectorized", **SIZES)
+    mcmc = MCMC(FunctionSpaceHMC(model), chain_method="vectorized", **SIZES)
     mcmc.run(jr.key(3), DATUM)
     samples = mcmc.get_samples(group_by_chain=True)["mean"]
     assert len(samples.sharding.device_set) == jax.device_count()
@@ -125,7 +123,7 @@ RUNS = {
 }
 
 
-IN_TWO_PROCESSES = ["evidence", "vectorised", "checkpointed", "trained"]
+IN_TWO_PROCESSES = ["evidence", "checkpointed", "trained"]  # and, by tests/test_docs.py, others
 
 
 def results(mesh, folder, names=RUNS) -> dict:

@@ -366,7 +366,7 @@ def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
             inputs, error = rows(network, key)
             t, x, *fixed = inputs
             states = x.reshape(t.size, *x.shape[2:])
-            output, network = over_batch(network, t.ravel(), states, *fixed, problem.spread)
+            output, network = over_batch(network, t.ravel(), states, *fixed, spread=problem.spread)
             return error(output.reshape(*t.shape, *output.shape[1:])), network
 
         def one(key):
