@@ -32,7 +32,9 @@ def curves(space):
     return space.from_points(0.5 * np.cos(s)), space.from_points(0.3 + 0.8 * np.sin(s) + 0.1 * np.cos(3 * s))
 
 
-def allen_cahn(num_modes: int, num_steps: int, variance: float = 0.01, **settings) -> nb.GuidedBridge:
+def allen_cahn(
+    num_modes: int, num_steps: int, scheme: str = "euler", variance: float = 0.01, **settings
+) -> nb.GuidedBridge:
     space = nb.FourierBasis(num_modes, 1)
     spectrum = 0.04 * (1 - space.laplacian) ** -2.0
 
@@ -40,7 +42,9 @@ def allen_cahn(num_modes: int, num_steps: int, variance: float = 0.01, **setting
         u = space.to_points(x)
         return space.from_points(u - u**3)
 
-    sde = nb.SemilinearSDE(0.1 * space.laplacian, reaction, jnp.sqrt(spectrum), space=space)
+    sde = nb.SemilinearSDE(
+        0.1 * space.laplacian, reaction, jnp.sqrt(spectrum), space=space, scheme=scheme
+    )
     x0, v = curves(space)
     condition = nb.InexactMatch(variance, normalised=False).at(v)
     return nb.GuidedBridge(sde, condition, x0=x0, t1=1.0, num_steps=num_steps, **settings)
@@ -90,12 +94,14 @@ def still(bridge):
 
 def show_allen_cahn(quick: bool) -> None:
     resolutions = [(4, 100), (16, 100), (64, 100), (256, 100), (64, 50), (64, 200), (64, 400)]
-    num_particles = 100 if quick else 2000
-    for num_modes, num_steps in resolutions[:2] if quick else resolutions:
-        bridge = allen_cahn(num_modes, num_steps)
+    rows = [(*row, "euler") for row in resolutions]
+    rows += [(64, num_steps, "midpoint") for num_steps in (25, 50, 100, 400)]
+    num_particles = 100 if quick else 8000
+    for num_modes, num_steps, scheme in rows[:2] if quick else rows:
+        bridge = allen_cahn(num_modes, num_steps, scheme)
         z = jr.normal(jr.key(0), (num_particles, *bridge.noise_shape))
         seconds, log_weights = seconds_of(bridge.log_weight, z)
-        row = {"case": "allen_cahn", "functions": 2 * num_modes + 1, "steps": num_steps}
+        row = {"case": "allen_cahn", "functions": 2 * num_modes + 1, "steps": num_steps, "scheme": scheme}
         print(json.dumps(row | quality(log_weights) | {"seconds": round(seconds, 2)}), flush=True)
     for guide, num_particles in ((nb.FrozenGuide(rounds=2), 4000), (nb.Unguided(), 1_000_000)):
         bridge = allen_cahn(4, 100, variance=0.1, guide=guide)

@@ -237,6 +237,7 @@ def table() -> dict[str, Row]:
             diffusion=("free", 0.5),
             args="free",
             space="space?",
+            scheme=("name", "midpoint"),
         ),
         "KunitaFlow": row(
             nb.KunitaFlow,

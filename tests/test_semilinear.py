@@ -7,6 +7,8 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import scipy.integrate
+import scipy.linalg
 import scipy.stats
 from numpyro.infer.util import log_density
 
@@ -158,6 +160,52 @@ def test_one_step_has_the_closed_form():
     variance = -0.25 * np.expm1(-1.0) / 2 + 0.1
     expected = -0.5 * (0.3 - mean) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)
     np.testing.assert_allclose(bridge.log_weight(np.zeros(bridge.noise_shape)), expected, rtol=1e-12)
+
+
+def test_one_step_by_the_midpoint_has_the_closed_form():
+    sde = nb.SemilinearSDE(-1.0, lambda t, x, args: jnp.sin(x), 0.5, scheme="midpoint")
+    bridge = nb.GuidedBridge(sde, nb.InexactMatch(0.1).at([0.3]), x0=[0.1], t1=0.5, num_steps=1)
+    half = np.exp(-0.25) * 0.1 - np.expm1(-0.25) * np.sin(0.1)
+    mean = np.exp(-0.5) * 0.1 - np.expm1(-0.5) * np.sin(half)
+    variance = -0.25 * np.expm1(-1.0) / 2 * np.exp(0.5 * np.cos(half)) + 0.1
+    expected = -0.5 * (0.3 - mean) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)
+    np.testing.assert_allclose(bridge.log_weight(np.zeros(bridge.noise_shape)), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("A", [-1.0, [-1.0, -3.0], [[-1.0, 0.6], [-0.2, -3.0]]], ids=["scalar", "diagonal", "matrix"])
+def test_order_of_the_schemes(A):
+    """Mean and covariance at t = 1 of dX = (A X + S X) dt + σ dW, against the exact law: halving steps, 1/2 and 1/4."""
+    A, S, sigma = np.array(A), np.array([0.7, -0.4]), np.array([0.5, 0.8])
+    x0, one = np.array([1.0, -0.5]), np.eye(2)
+    whole = (A if A.ndim == 2 else A * one) + np.diag(S)
+    mean = scipy.linalg.expm(whole) @ x0
+    spread = [scipy.linalg.expm(whole * u) @ np.diag(sigma) for u in np.linspace(0, 1, 2001)]
+    covariance = scipy.integrate.simpson([s @ s.T for s in spread], dx=1 / 2000, axis=0)
+
+    def errors(scheme, K):
+        sde = nb.SemilinearSDE(A, lambda t, x, args: jnp.asarray(S) * x, sigma, scheme=scheme)
+        x, P = jnp.asarray(x0), jnp.zeros((2, 2))
+        step = jax.jit(lambda x: sde.transition(0.0, 1 / K, x))
+        slope = jax.jacfwd(lambda x: step(x).mean)(x)
+        for _ in range(K):
+            law = step(x)
+            own = law.covariance if law.covariance.ndim == 2 else jnp.diag(law.covariance)
+            x, P = law.mean, slope @ P @ slope.T + own
+        return np.max(np.abs(x - mean)), np.max(np.abs(P - covariance))
+
+    euler = np.divide(errors("euler", 8), errors("euler", 16))
+    midpoint = np.divide(errors("midpoint", 8), errors("midpoint", 16))
+    assert np.all((1.7 < euler) & (euler < 2.4)), euler
+    assert np.all((3.3 < midpoint) & (midpoint < 4.8)), midpoint
+
+
+def test_a_scheme_without_a_nonlinearity_is_exact():
+    linear = nb.LinearSDE([-0.5, -2.0], 0.4)
+    step = linear.transition(0.0, 0.7, jnp.ones(2))
+    sde = nb.SemilinearSDE([-0.5, -2.0], lambda t, x, args: 0 * x, 0.4, scheme="midpoint")
+    found = sde.transition(0.0, 0.7, jnp.ones(2))
+    np.testing.assert_allclose(found.mean, step.mean, rtol=1e-13)
+    np.testing.assert_allclose(found.covariance, step.covariance, rtol=1e-13)
 
 
 def test_a_chain_of_observations_is_that_of_quadrature():

@@ -166,7 +166,7 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
     "SemilinearSDE": (
         nb.SemilinearSDE,
         {"linear": times([-0.5, 0.0, 0.3]), "nonlinearity": lambda t, x, args: args * jnp.sin(x), "args": times(0.6)}
-        | {"diffusion": times(0.4), "space": POINTS},
+        | {"diffusion": times(0.4), "space": POINTS, "scheme": "midpoint"},
         weight,
     ),
     "BrownianMotion": (nb.BrownianMotion, {"covariance": times(Q @ Q.T), "space": POINTS}, weight),

@@ -15,7 +15,6 @@ from ._curves import (
 from ._cylinder import CylinderSet as CylinderSet, IntervalCensored as IntervalCensored
 from ._density import (
     AbstractDensityMatch as AbstractDensityMatch,
-    DensityCondition as DensityCondition,
     DensityMatch as DensityMatch,
 )
 from ._distance import HuberMatch as HuberMatch, ProcrustesMatch as ProcrustesMatch, StudentMatch as StudentMatch

@@ -76,7 +76,7 @@ class AbstractDensityMatch(AbstractMatch):
         """The condition that `observed` was seen."""
         observed = as_float(observed, "observed")
         require_finite(observed, "observed")
-        return DensityCondition(self, observed)
+        return _DensityCondition(self, observed)
 
     def sample(self, key: PRNGKeyArray, sde: AbstractSDE, x: State) -> Array:
         raise ValueError(
@@ -161,7 +161,7 @@ class _Guiding(eqx.Module):
         return gaussian_log_density(self.value - self.operator @ y, jnp.ones((), y.dtype))
 
 
-class DensityCondition(AbstractCondition):
+class _DensityCondition(AbstractCondition):
     """A match by its density at its datum."""
 
     match: AbstractDensityMatch
@@ -179,7 +179,7 @@ class DensityCondition(AbstractCondition):
     def num_extra_noises(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return int(self.match.spread is not None)
 
-    def _with(self, **fields) -> "DensityCondition":
+    def _with(self, **fields) -> "_DensityCondition":
         other = copy(self)
         for name, value in fields.items():
             object.__setattr__(other, name, value)

@@ -6,14 +6,15 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from .._checks import as_float, require, require_finite
-from .._linalg import add, apply
+from .._checks import as_float, choice, require, require_finite
+from .._linalg import add, apply, compose, congruence
 from .._types import RealScalar, State, Structured
 from ..spaces import AbstractSpace
 from ._base import AbstractSDE, AffineStep, Transition, at_any_time
-from ._exponential import affine_step, exponential_noise_size, exponential_transition
+from ._exponential import affine_step, exponential_noise_size, exponential_transition, flow
 from ._sde import AbstractFunctionSDE
 
 _MAX_LINEARISED = 64
@@ -37,12 +38,17 @@ class SemilinearSDE(AbstractFunctionSDE):
     - `diffusion`: B, an array, `()`, `(n,)` or `(n, k)`, or a function `f(t, x, args)` that returns one.
     - `args`: the parameters of the functions, a pytree of arrays, as for `SDE`.
     - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
+    - `scheme`: `"euler"`, or `"midpoint"`, which takes F and B where half a step without noise leads, and stretches the
+      noise of the step by e^{½ dt F'}, F' its diagonal (beyond 64 numbers one for all, by one product with F'). For
+      B that does not depend on x what is left of the error is of second order where F is linear and diagonal, and
+      smaller than Euler's elsewhere; a step costs two to three times as much.
 
     Lord, Powell and Shardlow (2014), An Introduction to Computational Stochastic PDEs, section 10.8.
     """
 
     linear: Structured
     nonlinearity_function: Any
+    scheme: str = eqx.field(static=True)
     pull: ClassVar[str] = "nonlinearity"
 
     def __init__(
@@ -53,7 +59,9 @@ class SemilinearSDE(AbstractFunctionSDE):
         args: Any = None,
         *,
         space: AbstractSpace | None = None,
+        scheme: str = "euler",
     ):
+        self.scheme = choice(scheme, "scheme", ("euler", "midpoint"))
         self.linear = as_float(linear, "linear")
         shape = self.linear.shape
         require(
@@ -75,7 +83,26 @@ class SemilinearSDE(AbstractFunctionSDE):
         return self.linear.astype(x.dtype)
 
     def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
-        return exponential_transition(self._generator(x), self.pulled(t0, x), self.noise(t0, x), t1 - t0, x)
+        dt = t1 - t0
+        A, F = self._generator(x), self.pulled(t0, x)
+        if self.scheme == "euler":
+            return exponential_transition(A, F, self.noise(t0, x), dt, x)
+        still = jnp.zeros((), x.dtype)
+        growth, shift, _ = flow(A, F, still, 0.5 * dt)
+        half = x + apply(growth, x) + shift
+        t = t0 + 0.5 * dt
+        step = exponential_transition(A, self.pulled(t, half), self.noise(t, half), dt, x)
+        stretch = jnp.exp(0.5 * dt * self._mean_slope(t, half))
+        factor = compose(stretch, step.factor)
+        return Transition(x, step.increment, factor, congruence(stretch, step.covariance))
+
+    def _mean_slope(self, t: RealScalar, x: State) -> Structured:
+        """The diagonal of F', or of large states its mean, nearly: vᵀ F' v / n for one v of random signs."""
+        if x.size <= _MAX_LINEARISED:
+            return self._diagonal_slope(t, x)
+        signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], x.shape), x.dtype)
+        _, along = jax.jvp(lambda y: self.pulled(t, y), (x,), (signs,))
+        return jnp.sum(signs * along) / x.size
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         """A + F'(x) and β; of F' its diagonal for states of more than 64 numbers, so that a diagonal A stays one."""
