@@ -169,6 +169,11 @@ TABLE: dict[str, tuple[type, dict[str, Any], Callable]] = {
         | {"diffusion": times(0.4), "space": POINTS, "scheme": "midpoint"},
         weight,
     ),
+    "Flattened": (
+        nb.sdes.Flattened,
+        {"sde": Of(lambda t: nb.LinearSDE([-0.5 * t, 0.0, 0.3], 0.4)), "dim": 2},
+        lambda sde: weight(sde, nb.InexactMatch(0.05).at(np.ravel(SEEN)), np.ravel(X0)),
+    ),
     "BrownianMotion": (nb.BrownianMotion, {"covariance": times(Q @ Q.T), "space": POINTS}, weight),
     "BrownianMotion, factor": (nb.BrownianMotion, {"factor": times(R), "space": POINTS}, weight),
     "KunitaFlow": (
