@@ -1,5 +1,6 @@
 """Conditions by their density: normal ones against `InexactMatch`, others against quadrature, SciPy and NumPy."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -139,6 +140,34 @@ def test_a_path_of_heavy_tails_has_a_noise(key):
         assert np.hypot(*errors) < 0.03
         assert abs(jnp.mean(drawn) - jnp.mean(weighed)) < 4 * np.hypot(*errors)
     assert abs(jnp.mean(drawn)) > 0.03  # not by 0 on both sides
+
+
+def test_a_tilt_has_no_curvature():
+    """ψ = exp(a · x), of which the Gaussian that guides is nearly flat: log E exp(a · X) = a · m + ½ aᵀ C a."""
+    a = np.array([0.7, -1.2])
+    match = nb.DensityMatch(lambda x, v, args: jnp.sum(args * x), a)
+    bridge = nb.GuidedBridge(BROWNIAN, match.at(0.0), x0=VECTOR, t1=1.0, num_steps=3)
+    found = nb.estimate_evidence(bridge, jr.key(0), 2000)
+    assert found.standard_error < 1e-3 and nb.weights.pareto_k(found.log_weights) < 0.7
+    assert abs(found.log_evidence - (a @ VECTOR + 0.25 * a @ a)) < 4 * found.standard_error
+
+
+def test_a_module_is_a_function():
+    """Its arrays are parameters."""
+
+    class Tilt(eqx.Module):
+        a: jax.Array
+
+        def __call__(self, x, observed, args):
+            return -0.5 * jnp.sum((x - observed - self.a) ** 2)
+
+    def log_weight(a):
+        bridge = nb.GuidedBridge(BROWNIAN, nb.DensityMatch(Tilt(a)).at(VECTOR), x0=VECTOR, t1=1.0, num_steps=2)
+        return bridge.log_weight(np.zeros(bridge.noise_shape))
+
+    value, slope = jax.jit(jax.value_and_grad(log_weight))(0.5)
+    close(value, -0.5 * 2 * 0.25 / 1.5 - np.log(1.5), 1e-9)
+    close(slope, -2 * 0.5 / 1.5, 1e-9)
 
 
 # Densities.

@@ -30,7 +30,7 @@ from .._checks import as_float, concrete, require, require_finite, require_posit
 from .._closed import Closed, close
 from .._linalg import solve_lower
 from .._types import State, Structured
-from ..sdes import AbstractSDE, Flattened, for_every_column
+from ..sdes import AbstractSDE, Flattened, for_every_column, wrapped
 from ._base import AbstractCondition, AbstractMatch, Observation, Target
 from ._message import gaussian_log_density
 
@@ -40,6 +40,8 @@ _PARTS = 0.5 ** np.arange(8)
 """Of a step, the best of which is taken."""
 _GRID = np.linspace(-8.0, 8.0, 401)
 """For integrals over the normal z of log τ = s z: the trapezoidal rule is exact, nearly, for what falls to 0."""
+_FLAT = 1e-3
+"""Curvature of log ψ, beside that of the law of the end state, that is too little to say where ψ̃ is: it gets this."""
 _LOG_2PI = 1.8378770664093453
 
 
@@ -108,7 +110,8 @@ class DensityMatch(AbstractDensityMatch):
     The function is held as it is when a bridge or a law is made, as for `SDE`.
     """
 
-    function: Callable = eqx.field(static=True)
+    function: Any
+    """`None` where the program is held in its place."""
     args: Any
     log_scale_sd: Float[Array, ""] | None
     sampler: Callable | None = eqx.field(static=True)
@@ -119,7 +122,7 @@ class DensityMatch(AbstractDensityMatch):
             good = callable(f) or (f is None and name == "sample")
             shape = "(x, observed, args)" if name == "log_density" else "(key, x, args)"
             require(good, f"`{name}` must be a function f{shape}; got {f!r}.")
-        self.function, self.sampler = log_density, sample
+        self.function, self.sampler = wrapped(log_density), sample
         self.args = jax.tree.map(lambda leaf: as_float(leaf, "args"), args)
         self.log_scale_sd = None if spread is None else positive(spread, "spread")
         self.program = None
@@ -131,8 +134,10 @@ class DensityMatch(AbstractDensityMatch):
     def closed(self, x: State, observed: State) -> Self:
         if self.program is not None:
             return self
-        program = close(self.function, x, observed, self.args)
-        return eqx.tree_at(lambda m: m.program, self, program, is_leaf=lambda leaf: leaf is None)
+        closed = copy(self)
+        object.__setattr__(closed, "program", close(self.function, x, observed, self.args))
+        object.__setattr__(closed, "function", None)
+        return closed
 
     def log_density(self, sde, x, observed):
         function = self.function if self.program is None else self.program
@@ -287,7 +292,9 @@ def _guiding(match: AbstractDensityMatch, observed: State, sde: AbstractSDE, mea
     root = for_every_column(_root(covariance), mean.size // mean.shape[0])
     y = mean.reshape(-1) + root @ _mode(log_density, precision, mean.reshape(-1), root)
     value, slope = jax.value_and_grad(log_density)(y)
-    R = _root(precision(y))
+    W, prior = precision(y), jnp.max(jnp.diagonal(covariance))
+    floor = jnp.where(jnp.max(jnp.diagonal(W)) * prior < _FLAT, _FLAT / prior, 0.0)
+    R = _root(W + floor * jnp.eye(len(W), dtype=W.dtype))
     guiding = _Guiding(y.reshape(mean.shape), R.T, R.T @ y + solve_lower(R, slope), jnp.zeros_like(value))
     log_scale = value - guiding.log_density(y)
     return eqx.tree_at(lambda g: g.log_scale, guiding, log_scale), (value, slope)

@@ -20,6 +20,6 @@ from ._noise import (
     LandmarkNoise as LandmarkNoise,
     SpectralNoise as SpectralNoise,
 )
-from ._sde import SDE as SDE
+from ._sde import SDE as SDE, wrapped as wrapped
 from ._semilinear import SemilinearSDE as SemilinearSDE
 from ._simulate import law_of_end as law_of_end, simulate as simulate

@@ -29,8 +29,8 @@ class _Static(eqx.Module):
         return self.function(t, x, args)
 
 
-def _wrapped(f: Callable) -> Any:
-    """A pytree, such as a module, keeps its leaves; a plain function becomes static."""
+def wrapped(f: Callable) -> Any:
+    """A function as a part of a module: a pytree keeps its leaves, a plain function becomes static."""
     return _Static(f) if jax.tree_util.all_leaves((f,)) else f
 
 
@@ -83,8 +83,8 @@ class AbstractFunctionSDE(AbstractSDE):
                 _takes_three(f),
                 f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add those it does without.",
             )
-        setattr(self, f"{self.pull}_function", _wrapped(pull))
-        self.diffusion_function = _wrapped(diffusion)
+        setattr(self, f"{self.pull}_function", wrapped(pull))
+        self.diffusion_function = wrapped(diffusion)
         self.args = jax.tree.map(lambda leaf: _parameter(leaf), args)
         require_space(space)
         self.space = space
