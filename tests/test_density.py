@@ -386,6 +386,9 @@ ERRORS = {
     "points \\[4\\] are repeated": lambda: nb.VarifoldMatch(0.1, 0.5).at(SQUARE[[0, 1, 2, 3, 0]]),
     "`observed` must be shaped like a state": lambda: bridge_to(nb.StudentMatch(0.1, 3.0), np.ones(3)),
     "`x0` must hold points in the plane or in space": lambda: bridge_to(nb.ProcrustesMatch(0.1)),
+    "got a state \\(5, 2\\) of FourierBasis": lambda: nb.ProcrustesMatch(0.1).log_density(
+        nb.LinearSDE(0.0, 1.0, space=nb.FourierBasis(2, 2)), jnp.ones((5, 2)), jnp.ones((5, 2))
+    ),
     "weighs the end state and is no law": lambda: nb.DiffusionEndpoint(
         BROWNIAN, SQUARE, nb.VarifoldMatch(0.1, 0.5), t1=1.0, num_steps=1
     ).sample(jr.key(0)),

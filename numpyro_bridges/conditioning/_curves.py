@@ -44,7 +44,11 @@ class AbstractCurveMatch(AbstractDensityMatch):
 
     def log_density(self, sde, x, observed):
         points = _points(sde, x)
-        return -0.5 * self.squared_distance(points, observed.astype(x.dtype)) / self.variance.astype(x.dtype)
+        return (
+            -0.5
+            * self.squared_distance(points, observed.astype(x.dtype))
+            / self.variance.astype(x.dtype)
+        )
 
     def precision(self, sde, x, observed):
         """By Gauss and Newton: ∂_x ∂_y ⟨μ_x, μ_y⟩ at y = x, divided by the variance."""
@@ -65,7 +69,9 @@ class AbstractCurveMatch(AbstractDensityMatch):
         )
         points = concrete(observed)
         if points is not None and np.all(np.isfinite(points)):
-            lengths = np.linalg.norm(np.diff(points, axis=0, append=points[: self.closed_curve]), axis=1)
+            lengths = np.linalg.norm(
+                np.diff(points, axis=0, append=points[: self.closed_curve]), axis=1
+            )
             require(
                 np.all(lengths > 0),
                 f"`observed` must have distinct neighbours; points {np.flatnonzero(lengths == 0)} are repeated by the "
@@ -77,8 +83,10 @@ class AbstractCurveMatch(AbstractDensityMatch):
         points = _points(sde, x)
         if self.num_points is None:
             return points
-        place = np.linspace(0.0, len(points), self.num_points, endpoint=False) if self.closed_curve else (
-            np.linspace(0.0, len(points) - 1.0, self.num_points)
+        place = (
+            np.linspace(0.0, len(points), self.num_points, endpoint=False)
+            if self.closed_curve
+            else (np.linspace(0.0, len(points) - 1.0, self.num_points))
         )
         before = place.astype(int)
         part = jnp.asarray(place - before, x.dtype)[:, None]
@@ -97,8 +105,13 @@ class CurrentMatch(AbstractCurveMatch):
     closed_curve: bool = eqx.field(static=True)
     num_points: int | None = eqx.field(static=True)
 
-    def __init__(self, variance, length_scale, *, closed_curve: bool = True, num_points: int | None = None):
-        self.variance, self.length_scale = positive(variance, "variance"), positive(length_scale, "length_scale")
+    def __init__(
+        self, variance, length_scale, *, closed_curve: bool = True, num_points: int | None = None
+    ):
+        self.variance, self.length_scale = (
+            positive(variance, "variance"),
+            positive(length_scale, "length_scale"),
+        )
         self.closed_curve, self.num_points = flag(closed_curve, "closed_curve"), _count(num_points)
 
     def inner(self, x, y):
@@ -131,9 +144,18 @@ class VarifoldMatch(AbstractCurveMatch):
     num_points: int | None = eqx.field(static=True)
 
     def __init__(
-        self, variance, length_scale, angle_scale=1.0, *, closed_curve: bool = True, num_points: int | None = None
+        self,
+        variance,
+        length_scale,
+        angle_scale=1.0,
+        *,
+        closed_curve: bool = True,
+        num_points: int | None = None,
     ):
-        self.variance, self.length_scale = positive(variance, "variance"), positive(length_scale, "length_scale")
+        self.variance, self.length_scale = (
+            positive(variance, "variance"),
+            positive(length_scale, "length_scale"),
+        )
         self.angle_scale = positive(angle_scale, "angle_scale")
         self.closed_curve, self.num_points = flag(closed_curve, "closed_curve"), _count(num_points)
 
@@ -141,7 +163,9 @@ class VarifoldMatch(AbstractCurveMatch):
         (c, edges), (d, others) = _edges(x, self.closed_curve), _edges(y, self.closed_curve)
         lengths, other_lengths = (jnp.linalg.norm(e, axis=1) for e in (edges, others))
         near = _gaussian(c, d, self.length_scale)
-        along = _gaussian(edges / lengths[:, None], others / other_lengths[:, None], self.angle_scale)
+        along = _gaussian(
+            edges / lengths[:, None], others / other_lengths[:, None], self.angle_scale
+        )
         return lengths @ (near * along) @ other_lengths
 
 
@@ -151,7 +175,9 @@ def _points(sde: AbstractSDE, x: State) -> Points:
 
 def _edges(points: Points, closed_curve: bool) -> tuple[Points, Points]:
     """Centres and vectors."""
-    first, second = (points, jnp.roll(points, -1, axis=0)) if closed_curve else (points[:-1], points[1:])
+    first, second = (
+        (points, jnp.roll(points, -1, axis=0)) if closed_curve else (points[:-1], points[1:])
+    )
     return 0.5 * (first + second), second - first
 
 

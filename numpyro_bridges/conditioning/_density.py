@@ -117,7 +117,14 @@ class DensityMatch(AbstractDensityMatch):
     sampler: Callable | None = eqx.field(static=True)
     program: Closed | None
 
-    def __init__(self, log_density: Callable, args: Any = None, *, sample: Callable | None = None, spread=None):
+    def __init__(
+        self,
+        log_density: Callable,
+        args: Any = None,
+        *,
+        sample: Callable | None = None,
+        spread=None,
+    ):
         for name, f in (("log_density", log_density), ("sample", sample)):
             good = callable(f) or (f is None and name == "sample")
             shape = "(x, observed, args)" if name == "log_density" else "(key, x, args)"
@@ -215,7 +222,9 @@ class _DensityCondition(AbstractCondition):
         z = jnp.asarray(_GRID, x.dtype)
         log_scale = self.match.spread.astype(x.dtype) * z
         r = self._known.value - self._known.operator @ x.reshape(-1)
-        log_density = 0.5 * len(r) * (log_scale - _LOG_2PI) - 0.5 * jnp.exp(log_scale) * jnp.sum(r * r)
+        log_density = 0.5 * len(r) * (log_scale - _LOG_2PI) - 0.5 * jnp.exp(log_scale) * jnp.sum(
+            r * r
+        )
         return log_density - 0.5 * z * z - 0.5 * _LOG_2PI + jnp.log(z[1] - z[0])
 
     def closed(self, x):
@@ -261,7 +270,9 @@ class _DensityCondition(AbstractCondition):
 
     def observation(self, sde, x):
         sd = jnp.exp(-0.5 * self._log_scale()).astype(x.dtype)
-        return Observation(self._known.operator.astype(x.dtype), sd, self._known.log_scale.astype(x.dtype))
+        return Observation(
+            self._known.operator.astype(x.dtype), sd, self._known.log_scale.astype(x.dtype)
+        )
 
     def reference(self, sde, x):
         return self._known.anchor.reshape(x.shape)
@@ -280,7 +291,13 @@ class _DensityCondition(AbstractCondition):
 
 
 @eqx.filter_jit
-def _guiding(match: AbstractDensityMatch, observed: State, sde: AbstractSDE, mean: State, covariance: Structured):
+def _guiding(
+    match: AbstractDensityMatch,
+    observed: State,
+    sde: AbstractSDE,
+    mean: State,
+    covariance: Structured,
+):
     """ψ̃ at the mode, and log ψ and its slope there."""
 
     def log_density(y):
@@ -295,7 +312,9 @@ def _guiding(match: AbstractDensityMatch, observed: State, sde: AbstractSDE, mea
     W, prior = precision(y), jnp.max(jnp.diagonal(covariance))
     floor = jnp.where(jnp.max(jnp.diagonal(W)) * prior < _FLAT, _FLAT / prior, 0.0)
     R = _root(W + floor * jnp.eye(len(W), dtype=W.dtype))
-    guiding = _Guiding(y.reshape(mean.shape), R.T, R.T @ y + solve_lower(R, slope), jnp.zeros_like(value))
+    guiding = _Guiding(
+        y.reshape(mean.shape), R.T, R.T @ y + solve_lower(R, slope), jnp.zeros_like(value)
+    )
     log_scale = value - guiding.log_density(y)
     return eqx.tree_at(lambda g: g.log_scale, guiding, log_scale), (value, slope)
 
@@ -307,7 +326,9 @@ def _root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.linalg.cholesky(S + nugget * jnp.eye(n, dtype=S.dtype))
 
 
-def _mode(log_density: Callable, precision: Callable, mean: Float[Array, " N"], root: Float[Array, "N N"]):
+def _mode(
+    log_density: Callable, precision: Callable, mean: Float[Array, " N"], root: Float[Array, "N N"]
+):
     """The ξ of the largest log ψ(m + S ξ) − ½ |ξ|², by Gauss and Newton; its derivatives by the implicit function."""
 
     def loss(xi):

@@ -16,6 +16,7 @@ from .._checks import choice, require
 from .._linalg import rows
 from .._types import State
 from ..sdes import AbstractSDE
+from ..spaces import Landmarks
 from ._density import AbstractDensityMatch, positive
 
 _LOG_PI = 1.1447298858494002
@@ -89,16 +90,21 @@ class HuberMatch(AbstractDensityMatch):
         loss = jnp.where(far, k * distance - 0.5 * k * k, 0.5 * square)
         # the integral over R^m in spherical coordinates, r < k and r > k
         area = jnp.log(2.0) + 0.5 * m * _LOG_PI - gammaln(0.5 * m)
-        inner = (0.5 * m - 1) * jnp.log(2.0) + gammaln(0.5 * m) + jnp.log(gammainc(0.5 * m, 0.5 * k * k))
+        inner = (
+            (0.5 * m - 1) * jnp.log(2.0)
+            + gammaln(0.5 * m)
+            + jnp.log(gammainc(0.5 * m, 0.5 * k * k))
+        )
         outer = 0.5 * k * k - m * jnp.log(k) + gammaln(1.0 * m) + jnp.log(gammaincc(1.0 * m, k * k))
         return -loss - log_scale - area - jnp.logaddexp(inner, outer)
-
 
     def precision(self, sde, x, observed):
         square, _ = _square(self.variance, sde, x, observed)
         k = self.threshold.astype(x.dtype)
         far = square > k * k
-        return _reweighted(jnp.where(far, k / jnp.sqrt(jnp.where(far, square, 1.0)), 1.0), self.variance, sde, x)
+        return _reweighted(
+            jnp.where(far, k / jnp.sqrt(jnp.where(far, square, 1.0)), 1.0), self.variance, sde, x
+        )
 
 
 class ProcrustesMatch(AbstractDensityMatch):
@@ -118,10 +124,12 @@ class ProcrustesMatch(AbstractDensityMatch):
         self.up_to = choice(up_to, "up_to", ("translation", "rigid", "similarity"))
 
     def log_density(self, sde, x, observed):
+        are_points = sde.space is None or isinstance(sde.space, Landmarks)
         dims = (1, 2, 3) if self.up_to == "translation" else (2, 3)
         require(
-            x.ndim == 2 and x.shape[1] in dims and sde.space is None or hasattr(sde.space, "num_points"),
-            f"`x0` must hold points in the plane or in space, (n, 2) or (n, 3); got {x.shape} in {sde.space}.",
+            are_points and x.ndim == 2 and x.shape[1] in dims,
+            f"`x0` must hold points in the plane or in space, (n, 2) or (n, 3); got a state {x.shape} "
+            f"of {sde.space}.",
         )
         weights = _weights(sde, x)
         v = _centred(weights, _like(observed, x))
