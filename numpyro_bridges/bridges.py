@@ -187,7 +187,7 @@ class GuidedBridge(eqx.Module):
             pivots = jnp.diagonal(pivots) if S.ndim == 2 else pivots
             scale = jnp.sqrt(jnp.max(jnp.abs(S)))
             require(
-                jnp.all(pivots > 1e-10 * scale),
+                jnp.all(pivots > 1e-7 * scale),  # of variances 1e-14: a singular matrix has pivots of rounding
                 "`condition` is an exact match, which needs noise in every observed direction, and the covariance of "
                 "the last step, L a Lᵀ dt, is singular: an observed component has no noise of its own. Use "
                 "`InexactMatch` with a small variance.",

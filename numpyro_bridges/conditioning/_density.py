@@ -41,7 +41,7 @@ _PARTS = 0.5 ** np.arange(8)
 _GRID = np.linspace(-8.0, 8.0, 401)
 """For integrals over the normal z of log τ = s z: the trapezoidal rule is exact, nearly, for what falls to 0."""
 _FLAT = 1e-3
-"""Curvature of log ψ, beside that of the law of the end state, that is too little to say where ψ̃ is: it gets this."""
+"""Least curvature of log ψ̃, beside that of the law of the end state: with less, v would be too far for its digits."""
 _LOG_2PI = 1.8378770664093453
 
 
@@ -310,8 +310,8 @@ def _guiding(
     y = mean.reshape(-1) + root @ _mode(log_density, precision, mean.reshape(-1), root)
     value, slope = jax.value_and_grad(log_density)(y)
     W, prior = precision(y), jnp.max(jnp.diagonal(covariance))
-    floor = jnp.where(jnp.max(jnp.diagonal(W)) * prior < _FLAT, _FLAT / prior, 0.0)
-    R = _root(W + floor * jnp.eye(len(W), dtype=W.dtype))
+    floor = _FLAT / prior * jnp.eye(len(W), dtype=W.dtype)
+    R = _root(floor + positive_part(W - floor))
     guiding = _Guiding(
         y.reshape(mean.shape), R.T, R.T @ y + solve_lower(R, slope), jnp.zeros_like(value)
     )
