@@ -20,9 +20,10 @@ from jaxtyping import Array, Float
 
 from .._checks import as_float, concrete, flag, positive_integer, require
 from .._types import State
+from ..kernels._parameters import positive_scalar, squared_distances
 from ..sdes import AbstractSDE
 from ._base import AbstractCondition
-from ._density import AbstractDensityMatch, positive
+from ._density import AbstractDensityMatch
 
 Points = Float[Array, "n dim"]
 
@@ -44,11 +45,8 @@ class AbstractCurveMatch(AbstractDensityMatch):
 
     def log_density(self, sde, x, observed):
         points = _points(sde, x)
-        return (
-            -0.5
-            * self.squared_distance(points, observed.astype(x.dtype))
-            / self.variance.astype(x.dtype)
-        )
+        square = self.squared_distance(points, observed.astype(x.dtype))
+        return -0.5 * square / self.variance.astype(x.dtype)
 
     def precision(self, sde, x, observed):
         """By Gauss and Newton: ∂_x ∂_y ⟨μ_x, μ_y⟩ at y = x, divided by the variance."""
@@ -69,9 +67,8 @@ class AbstractCurveMatch(AbstractDensityMatch):
         )
         points = concrete(observed)
         if points is not None and np.all(np.isfinite(points)):
-            lengths = np.linalg.norm(
-                np.diff(points, axis=0, append=points[: self.closed_curve]), axis=1
-            )
+            edges = np.diff(points, axis=0, append=points[: self.closed_curve])
+            lengths = np.linalg.norm(edges, axis=1)
             require(
                 np.all(lengths > 0),
                 f"`observed` must have distinct neighbours; points {np.flatnonzero(lengths == 0)} are repeated by the "
@@ -83,11 +80,8 @@ class AbstractCurveMatch(AbstractDensityMatch):
         points = _points(sde, x)
         if self.num_points is None:
             return points
-        place = (
-            np.linspace(0.0, len(points), self.num_points, endpoint=False)
-            if self.closed_curve
-            else (np.linspace(0.0, len(points) - 1.0, self.num_points))
-        )
+        last = len(points) - (not self.closed_curve)
+        place = np.linspace(0.0, last, self.num_points, endpoint=not self.closed_curve)
         before = place.astype(int)
         part = jnp.asarray(place - before, x.dtype)[:, None]
         after = (before + 1) % len(points)
@@ -108,11 +102,10 @@ class CurrentMatch(AbstractCurveMatch):
     def __init__(
         self, variance, length_scale, *, closed_curve: bool = True, num_points: int | None = None
     ):
-        self.variance, self.length_scale = (
-            positive(variance, "variance"),
-            positive(length_scale, "length_scale"),
-        )
-        self.closed_curve, self.num_points = flag(closed_curve, "closed_curve"), _count(num_points)
+        self.variance = positive_scalar("variance")(variance)
+        self.length_scale = positive_scalar("length_scale")(length_scale)
+        self.closed_curve = flag(closed_curve, "closed_curve")
+        self.num_points = _count(num_points)
 
     def inner(self, x, y):
         (c, edges), (d, others) = _edges(x, self.closed_curve), _edges(y, self.closed_curve)
@@ -152,12 +145,11 @@ class VarifoldMatch(AbstractCurveMatch):
         closed_curve: bool = True,
         num_points: int | None = None,
     ):
-        self.variance, self.length_scale = (
-            positive(variance, "variance"),
-            positive(length_scale, "length_scale"),
-        )
-        self.angle_scale = positive(angle_scale, "angle_scale")
-        self.closed_curve, self.num_points = flag(closed_curve, "closed_curve"), _count(num_points)
+        self.variance = positive_scalar("variance")(variance)
+        self.length_scale = positive_scalar("length_scale")(length_scale)
+        self.angle_scale = positive_scalar("angle_scale")(angle_scale)
+        self.closed_curve = flag(closed_curve, "closed_curve")
+        self.num_points = _count(num_points)
 
     def inner(self, x, y):
         (c, edges), (d, others) = _edges(x, self.closed_curve), _edges(y, self.closed_curve)
@@ -182,8 +174,7 @@ def _edges(points: Points, closed_curve: bool) -> tuple[Points, Points]:
 
 
 def _gaussian(x: Points, y: Points, scale) -> Float[Array, "n m"]:
-    square = jnp.sum((x[:, None] - y[None]) ** 2, axis=-1)
-    return jnp.exp(-square / scale.astype(x.dtype) ** 2)
+    return jnp.exp(-squared_distances(x, y) / scale.astype(x.dtype) ** 2)
 
 
 def _count(num_points: int | None) -> int | None:

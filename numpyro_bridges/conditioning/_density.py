@@ -26,10 +26,11 @@ import jax.random as jr
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._checks import as_float, concrete, require, require_finite, require_positive
+from .._checks import as_float, concrete, require, require_finite
 from .._closed import Closed, close
 from .._linalg import solve_lower
 from .._types import State, Structured
+from ..kernels._parameters import positive_scalar
 from ..sdes import AbstractSDE, Flattened, for_every_column, wrapped
 from ._base import AbstractCondition, AbstractMatch, Observation, Target
 from ._message import gaussian_log_density
@@ -131,7 +132,7 @@ class DensityMatch(AbstractDensityMatch):
             require(good, f"`{name}` must be a function f{shape}; got {f!r}.")
         self.function, self.sampler = wrapped(log_density), sample
         self.args = jax.tree.map(lambda leaf: as_float(leaf, "args"), args)
-        self.log_scale_sd = None if spread is None else positive(spread, "spread")
+        self.log_scale_sd = None if spread is None else positive_scalar("spread")(spread)
         self.program = None
 
     @property
@@ -201,8 +202,6 @@ class _DensityCondition(AbstractCondition):
         return self if self.match.spread is None else self._with(draw=extra)
 
     def draw_of(self, x, shape, key):
-        if self.match.spread is None:
-            return super().draw_of(x, shape, key)
         rest = jnp.zeros(shape, x.dtype) if key is None else jr.normal(key, shape, x.dtype)
         log_mass = self._log_terms(x)
         place = 0.5 if key is None else jr.uniform(jr.fold_in(key, 1), dtype=x.dtype)
@@ -386,11 +385,3 @@ def _(primals, tangents):
     differences = jnp.where(same, jnp.where(values > 0, 1.0, 0.0)[:, None], quotient)
     change = vectors.T @ (0.5 * (dS + dS.T)) @ vectors
     return (vectors * kept[None]) @ vectors.T, vectors @ (differences * change) @ vectors.T
-
-
-def positive(value, name: str) -> Float[Array, ""]:
-    """A positive number as an array."""
-    value = as_float(value, name)
-    require(value.ndim == 0, f"`{name}` must be a number; got shape {value.shape}.")
-    require_positive(value, name)
-    return value

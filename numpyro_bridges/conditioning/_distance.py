@@ -15,9 +15,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .._checks import choice, require
 from .._linalg import rows
 from .._types import State
+from ..kernels._parameters import positive_scalar
 from ..sdes import AbstractSDE
 from ..spaces import Landmarks
-from ._density import AbstractDensityMatch, positive
+from ._density import AbstractDensityMatch
 
 _LOG_PI = 1.1447298858494002
 
@@ -36,8 +37,8 @@ class StudentMatch(AbstractDensityMatch):
     degrees_of_freedom: Float[Array, ""]
 
     def __init__(self, variance, degrees_of_freedom):
-        self.variance = positive(variance, "variance")
-        self.degrees_of_freedom = positive(degrees_of_freedom, "degrees_of_freedom")
+        self.variance = positive_scalar("variance")(variance)
+        self.degrees_of_freedom = positive_scalar("degrees_of_freedom")(degrees_of_freedom)
 
     @property
     def spread(self):
@@ -75,8 +76,8 @@ class HuberMatch(AbstractDensityMatch):
     threshold: Float[Array, ""]
 
     def __init__(self, variance, threshold=1.345):
-        self.variance = positive(variance, "variance")
-        self.threshold = positive(threshold, "threshold")
+        self.variance = positive_scalar("variance")(variance)
+        self.threshold = positive_scalar("threshold")(threshold)
 
     @property
     def spread(self):
@@ -120,7 +121,7 @@ class ProcrustesMatch(AbstractDensityMatch):
     up_to: str = eqx.field(static=True)
 
     def __init__(self, variance, up_to: str = "similarity"):
-        self.variance = positive(variance, "variance")
+        self.variance = positive_scalar("variance")(variance)
         self.up_to = choice(up_to, "up_to", ("translation", "rigid", "similarity"))
 
     def log_density(self, sde, x, observed):

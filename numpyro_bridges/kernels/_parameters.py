@@ -17,8 +17,8 @@ def scalar(value: Array, name: str, dtype: jnp.dtype) -> Float[Array, ""]:
     """
     require(
         jnp.ndim(value) == 0,
-        f"`{name}` must be a scalar; got an array of shape {jnp.shape(value)}. For a batch of kernels, "
-        "`jax.vmap` the constructor, and with it the function that uses the kernel.",
+        f"`{name}` must be a scalar; got an array of shape {jnp.shape(value)}. For a batch, "
+        "`jax.vmap` the constructor, and with it the function that uses what it makes.",
     )
     return value.astype(dtype)
 
