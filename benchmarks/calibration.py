@@ -1,13 +1,15 @@
-"""Is the posterior of each kernel calibrated? Simulation-based calibration (Talts and others, 2018).
+"""Is the posterior of each kernel calibrated? Simulation-based calibration (Talts and others,
+2018).
 
-Parameters are drawn from the prior, data simulated forward, and posterior draws ranked against the truth: each
-parameter, a functional of the path (its middle, on average over points) and the log joint density of all; on a tree a
-coordinate of an ancestor and the log likelihood, which shows data that are thrown away. Ranks of an
-exact sampler are uniform; their ECDF stays within a simultaneous 95 % band (Säilynoja, Bürkner and Vehtari, 2022).
-Of four statistics one leaves its band by chance in one run of six, so each has a p-value too, `uniformity`.
+Parameters are drawn from the prior, data simulated forward, and posterior draws ranked against the
+truth: each parameter, a functional of the path (its middle, on average over points) and the log
+joint density of all; on a tree a coordinate of an ancestor and the log likelihood, which shows data
+that are thrown away. Ranks of an exact sampler are uniform; their ECDF stays within a simultaneous
+95 % band (Säilynoja, Bürkner and Vehtari, 2022). Of four statistics one leaves its band by chance
+in one run of six, so each has a p-value too, `uniformity`.
 
-Three models: a nonlinear scalar SDE, a Kunita flow of two landmarks, and one of four on a tree of four tips. JSON
-lines, and a plot of the ECDF differences.
+Three models: a nonlinear scalar SDE, a Kunita flow of two landmarks, and one of four on a tree of
+four tips. JSON lines, and a plot of the ECDF differences.
 
     python benchmarks/calibration.py --output output          # all kernels, 256 replicates each
     python benchmarks/calibration.py --quick --kernels FunctionSpaceHMC
@@ -46,7 +48,11 @@ from numpyro_bridges.infer import (
 def sine(v=None):
     force = numpyro.sample("force", dist.Normal(1.0, 0.5))
     spread = numpyro.sample("spread", dist.LogNormal(-0.5, 0.3))
-    sde = nb.SDE(lambda t, x, a: a[0] * jnp.sin(2 * x), lambda t, x, a: a[1] * (1 + 0.3 * jnp.cos(x)), (force, spread))
+    sde = nb.SDE(
+        lambda t, x, a: a[0] * jnp.sin(2 * x),
+        lambda t, x, a: a[1] * (1 + 0.3 * jnp.cos(x)),
+        (force, spread),
+    )
     law = nb.DiffusionEndpoint(sde, np.zeros(1), nb.InexactMatch(0.05), t1=1.0, num_steps=10)
     nb.sample("v", law, obs=v)
 
@@ -68,7 +74,9 @@ def tree(v=None):
     length_scale = numpyro.sample("length_scale", dist.LogNormal(-0.3, 0.3))
     flow = nb.KunitaFlow(nb.Landmarks(4, 2), nb.GaussianKernel(amplitude, length_scale))
     x0 = np.array([[0.5, 0.0], [0.0, 0.5], [-0.5, 0.0], [0.0, -0.5]])
-    law = nb.DiffusionTree(flow, x0, nb.InexactMatch(0.002), tree=TREE, num_steps=TREE.num_steps(0.1))
+    law = nb.DiffusionTree(
+        flow, x0, nb.InexactMatch(0.002), tree=TREE, num_steps=TREE.num_steps(0.1)
+    )
     nb.sample("v", law, obs=v)
 
 
@@ -77,26 +85,36 @@ def with_nuts(kernel, **settings):
 
 
 MODELS = {"sine": sine, "landmarks": landmarks, "tree": tree}
-# Kernel, draws of the warm-up, draws, draws between those that are ranked.
-# Ranks are uniform among independent draws only: a quick run keeps every draw's distance and ranks fewer of them.
+# Kernel, draws of the warm-up, draws, draws between those that are ranked. Ranks are uniform among
+# independent draws only: a quick run keeps every draw's distance and ranks fewer of them.
 KERNELS = {
     "FunctionSpaceHMC": (FunctionSpaceHMC, 100, 200, 2),
     "PCN": (with_nuts(PCN, num_moves=2), 100, 400, 4),
     "PCNL": (with_nuts(PCNL), 100, 400, 4),
     "CorrelatedPseudoMarginal": (lambda model: CorrelatedPseudoMarginal(model, 4), 200, 3000, 30),
-    "CorrelatedPseudoMarginalMALA": (lambda model: CorrelatedPseudoMarginalMALA(model, 2), 200, 2000, 20),
+    "CorrelatedPseudoMarginalMALA": (
+        lambda model: CorrelatedPseudoMarginalMALA(model, 2),
+        200,
+        2000,
+        20,
+    ),
 }
 
 
 def statistics(model, z, v):
     """What is ranked: parameters, a functional of the path, log joint density of (θ, z, v)."""
-    trace = numpyro.handlers.trace(numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), z)).get_trace(v)
+    trace = numpyro.handlers.trace(
+        numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), z)
+    ).get_trace(v)
     sites = [site for site in trace.values() if site["type"] == "sample"]
     log_joint = sum(jnp.sum(site["fn"].log_prob(site["value"])) for site in sites)
     law = trace["v"]["fn"]
     scalars = {name: value for name, value in z.items() if name != "v_noise"}
     if isinstance(law, nb.DiffusionTree):
-        scalars |= {"coordinate of an ancestor": law.nodes(v)[1, 0, 0], "log likelihood": law.log_prob(v)}
+        scalars |= {
+            "coordinate of an ancestor": law.nodes(v)[1, 0, 0],
+            "log likelihood": law.log_prob(v),
+        }
     else:
         path = law.path(v)
         scalars["middle of the path"] = jnp.mean(path[len(path) // 2])
@@ -110,7 +128,11 @@ def ranks(name, kernel, model, num_replicates, num_warmup, num_draws, thin, seed
         key_prior, key_law, key_chain = jr.split(key, 3)
         prior = numpyro.handlers.trace(numpyro.handlers.seed(model, key_prior)).get_trace()
         v, noise = prior["v"]["fn"].sample_with_noise(key_law)
-        latent = {k: s["value"] for k, s in prior.items() if s["type"] == "sample" and k not in ("v", "v_noise")}
+        latent = {
+            k: s["value"]
+            for k, s in prior.items()
+            if s["type"] == "sample" and k not in ("v", "v_noise")
+        }
         truth = statistics(model, latent | {"v_noise": noise}, v)
         state = kernel.init(key_chain, num_warmup, None, (v,), {})
 
@@ -133,7 +155,9 @@ def ranks(name, kernel, model, num_replicates, num_warmup, num_draws, thin, seed
 
 
 def band(num_replicates, num_ranks, level=0.95, simulations=4000):
-    """Half-widths of the ECDF of uniform ranks, at every rank, that hold at once; in the pointwise SD by simulation."""
+    """Half-widths of the ECDF of uniform ranks, at every rank, that hold at once; in the pointwise
+    SD by simulation.
+    """
     grid = np.arange(1, num_ranks) / num_ranks
     rng = np.random.default_rng(0)
     uniform = rng.integers(0, num_ranks, size=(simulations, num_replicates))
@@ -151,11 +175,11 @@ def difference(found, num_ranks):
 def uniformity(found, num_ranks):
     """A p-value of uniform ranks, against a posterior at the wrong place or of the wrong width.
 
-    With U uniform, z = Φ⁻¹((rank + U) / num_ranks) is exactly standard normal. Its mean is N(0, 1/R)
-    and its sum of squares χ²_R; twice the smaller of their two-sided p-values is at most p with
-    probability p. Below 2.5e-5, which one of four statistics reaches by chance in one run of 10 000,
-    it finds with probability 0.9, from 256 ranks among 25 draws, a posterior that is shifted by 0.38
-    of its SD, or whose SD is wrong by a factor of 0.71 or 1.39.
+    With U uniform, z = Φ⁻¹((rank + U) / num_ranks) is exactly standard normal. Its mean is N(0,
+    1/R) and its sum of squares χ²_R; twice the smaller of their two-sided p-values is at most p
+    with probability p. Below 2.5e-5, which one of four statistics reaches by chance in one run of
+    10 000, it finds with probability 0.9, from 256 ranks among 25 draws, a posterior that is
+    shifted by 0.38 of its SD, or whose SD is wrong by a factor of 0.71 or 1.39.
     """
     count = len(found)
     uniform = (found + np.random.default_rng(0).uniform(size=count)) / num_ranks
@@ -204,7 +228,9 @@ def main(arguments):
             found = ranks(name, build(MODELS[model]), MODELS[model], *settings)
             num_ranks = num_draws // thin + 1
             width = band(arguments.replicates, num_ranks)
-            excess = {k: float(np.max(np.abs(difference(r, num_ranks)) / width)) for k, r in found.items()}
+            excess = {
+                k: float(np.max(np.abs(difference(r, num_ranks)) / width)) for k, r in found.items()
+            }
             row = {
                 "kernel": name,
                 "model": model,

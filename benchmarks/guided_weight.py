@@ -2,10 +2,11 @@
 
     python benchmarks/guided_weight.py [--quick] [--x64] [--sizes 8 32 128] [--memory]
 
-One Kunita flow of n landmarks, 100 steps, 64 paths, the receding guide: value, and gradient with respect to the noise,
-the amplitude and the length scale; beside them the library's geodesic guide. One JSON line per size: run times (minimum
-over repeats, the programs in turn), their ratios, compile times, flops by XLA's cost analysis. Last the peak memory of
-one gradient at 256 landmarks, in a process of its own.
+One Kunita flow of n landmarks, 100 steps, 64 paths, the receding guide: value, and gradient with
+respect to the noise, the amplitude and the length scale; beside them the library's geodesic guide.
+One JSON line per size: run times (minimum over repeats, the programs in turn), their ratios,
+compile times, flops by XLA's cost analysis. Last the peak memory of one gradient at 256 landmarks,
+in a process of its own.
 """
 
 import argparse
@@ -28,7 +29,9 @@ NUM_STEPS, VARIANCE = 100, 1e-4
 def shapes(n: int):
     """A circle and an ellipse of n points."""
     s = np.linspace(0, 2 * np.pi, n, endpoint=False)
-    return np.stack([np.cos(s), np.sin(s)], 1), np.stack([1.2 * np.cos(s) + 0.1, 0.9 * np.sin(s)], 1)
+    return np.stack([np.cos(s), np.sin(s)], 1), np.stack(
+        [1.2 * np.cos(s) + 0.1, 0.9 * np.sin(s)], 1
+    )
 
 
 def library_weight(n: int, guide: str = "RecedingGuide"):
@@ -40,7 +43,9 @@ def library_weight(n: int, guide: str = "RecedingGuide"):
 
     def log_weight(parameters, noise):
         flow = nb.KunitaFlow(space, nb.GaussianKernel(*parameters), noise="landmark")
-        bridge = nb.GuidedBridge(flow, match.at(v), x0=x0, t1=1.0, num_steps=NUM_STEPS, guide=leading)
+        bridge = nb.GuidedBridge(
+            flow, match.at(v), x0=x0, t1=1.0, num_steps=NUM_STEPS, guide=leading
+        )
         return bridge.log_weight(noise)
 
     return log_weight
@@ -65,10 +70,18 @@ def plain_weight(n: int):
         def kick(x, a, tau, z):
             """The steering of one step: u, the whitened residual, and log|P| − log|N|."""
             A = jnp.sqrt(dt) * lax.linalg.cholesky(a, symmetrize_input=False)
-            P = lax.linalg.cholesky(tau * a + sd**2 * eye, symmetrize_input=False) if tau is not None else sd * eye
-            N = lax.linalg.cholesky((dt if tau is None else tau + dt) * a + sd**2 * eye, symmetrize_input=False)
+            P = (
+                lax.linalg.cholesky(tau * a + sd**2 * eye, symmetrize_input=False)
+                if tau is not None
+                else sd * eye
+            )
+            N = lax.linalg.cholesky(
+                (dt if tau is None else tau + dt) * a + sd**2 * eye, symmetrize_input=False
+            )
             y = solve_triangular(N, v - x, lower=True)
-            back = solve_triangular(N, y - solve_triangular(N + P, A @ z, lower=True), trans=1, lower=True)
+            back = solve_triangular(
+                N, y - solve_triangular(N + P, A @ z, lower=True), trans=1, lower=True
+            )
             log_det = jnp.sum(jnp.log(jnp.diagonal(P))) - jnp.sum(jnp.log(jnp.diagonal(N)))
             return A, z + A.T @ back, y, N, 2 * log_det
 
@@ -81,7 +94,12 @@ def plain_weight(n: int):
 
         (x, total), _ = lax.scan(step, (x0, 0.0), (noise[:-1], left))
         _, _, y, N, _ = kick(x, covariance(x), None, noise[-1])
-        return total - 0.5 * jnp.sum(y * y) - 2 * jnp.sum(jnp.log(jnp.diagonal(N))) - n * jnp.log(2 * jnp.pi)
+        return (
+            total
+            - 0.5 * jnp.sum(y * y)
+            - 2 * jnp.sum(jnp.log(jnp.diagonal(N)))
+            - n * jnp.log(2 * jnp.pi)
+        )
 
     return log_weight
 
@@ -126,10 +144,16 @@ def measure(n: int, num_paths: int, repeats: int) -> dict:
                 times[name].append(time.perf_counter() - start)
         for name in pair:
             row[f"{kind}_{name}_s"] = round(min(times[name]), 4)
-        row[f"{kind}_ratio"] = round(float(np.median(np.divide(times["library"], times["plain"]))), 3)
-        row[f"{kind}_geodesic_ratio"] = round(float(np.median(np.divide(times["geodesic"], times["library"]))), 3)
+        row[f"{kind}_ratio"] = round(
+            float(np.median(np.divide(times["library"], times["plain"]))), 3
+        )
+        row[f"{kind}_geodesic_ratio"] = round(
+            float(np.median(np.divide(times["geodesic"], times["library"]))), 3
+        )
     row["gradient_over_value"] = round(row["gradient_library_s"] / row["value_library_s"], 2)
-    row["value_difference"] = float(abs(results["value", "library"] / results["value", "plain"] - 1))
+    row["value_difference"] = float(
+        abs(results["value", "library"] / results["value", "plain"] - 1)
+    )
     row["jax"], row["device"] = jax.__version__, jax.devices()[0].device_kind
     return row
 
@@ -151,7 +175,9 @@ def peak_memory(n: int = 256) -> dict:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="8 landmarks, 8 paths")
     parser.add_argument("--x64", action="store_true")
     parser.add_argument("--sizes", type=int, nargs="*", default=[8, 32, 128])
@@ -162,6 +188,12 @@ if __name__ == "__main__":
         print(json.dumps(peak_memory()))
         sys.exit()
     for size in [8] if arguments.quick else arguments.sizes:
-        print(json.dumps(measure(size, 8 if arguments.quick else 64, 3 if arguments.quick else 7)), flush=True)
+        print(
+            json.dumps(measure(size, 8 if arguments.quick else 64, 3 if arguments.quick else 7)),
+            flush=True,
+        )
     if not arguments.quick:
-        subprocess.run([sys.executable, __file__, "--memory", *(["--x64"] if arguments.x64 else [])], check=True)
+        subprocess.run(
+            [sys.executable, __file__, "--memory", *(["--x64"] if arguments.x64 else [])],
+            check=True,
+        )

@@ -1,14 +1,17 @@
-"""How good is a guide? Spread of the log weight, evidence and time, for each guide on simulated, real and small cases.
+"""How good is a guide? Spread of the log weight, evidence and time, for each guide on simulated,
+real and small cases.
 
-    python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing butterflies cell gbm rounds]
+    python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing butterflies cell
+    gbm rounds]
 
-One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard error, ESS in percent, k̂
-and whether the evidence is to be trusted, seconds of a run without compilation, and seconds per effective particle. A
-standard error is infinite where it is not; `spread` is that of the weights drawn alone, sd(w)/(mean(w) √S).
-`reference` is a log evidence from elsewhere: a closed form, or a long run. All in double precision.
+One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard
+error, ESS in percent, k̂ and whether the evidence is to be trusted, seconds of a run without
+compilation, and seconds per effective particle. A standard error is infinite where it is not;
+`spread` is that of the weights drawn alone, sd(w)/(mean(w) √S). `reference` is a log evidence from
+elsewhere: a closed form, or a long run. All in double precision.
 
-The simulated Kunita cases and the butterflies are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or
-`../shared/data`.
+The simulated Kunita cases and the butterflies are read from the folder of data sets,
+`NUMPYRO_BRIDGES_DATA` or `../shared/data`.
 """
 
 import argparse
@@ -61,15 +64,19 @@ def found(case: str, file: Path) -> bool:
 
 
 def kunita():
-    """Three simulated end states of a strongly nonlinear flow: 16 landmarks, observation SD 0.032."""
+    """Three simulated ends of a strongly nonlinear flow: 16 landmarks, observation SD 0.032."""
     file = FOLDER / "kunita_cases" / "kunita_cases.npz"
     if not found("kunita", file):
         return
     data = np.load(file)
     space = nb.Landmarks(16, 2, weights=1.0)
-    flow = nb.KunitaFlow(space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5))
+    flow = nb.KunitaFlow(
+        space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5)
+    )
     match = nb.InexactMatch(1e-3)
-    for i, (target, reference) in enumerate(zip(data["edge_targets"], (24.75, 16.40, 9.65), strict=True)):
+    for i, (target, reference) in enumerate(
+        zip(data["edge_targets"], (24.75, 16.40, 9.65), strict=True)
+    ):
         setting = {"x0": data["root"], "t1": 1.0, "num_steps": 100}
         yield f"kunita {i}", flow, match.at(target), setting, reference, GUIDES
 
@@ -144,13 +151,27 @@ def rounds():
 
     volterra = nb.SDE(predation, lambda t, x, args: 0.3 * x)
     setting = {"x0": [0.5, 0.5], "t1": 5.0, "num_steps": 200}
-    yield "predator and prey", volterra, nb.InexactMatch(0.01).at([2.0, 1.0]), setting, None, RECEDING
+    yield (
+        "predator and prey",
+        volterra,
+        nb.InexactMatch(0.01).at([2.0, 1.0]),
+        setting,
+        None,
+        RECEDING,
+    )
     logistic = nb.SDE(lambda t, x, args: 2 * x * (1 - x / 2), lambda t, x, args: 0.4 * x)
     setting = {"x0": [0.3], "t1": 2.0, "num_steps": 100}
     yield "logistic growth", logistic, nb.ExactMatch().at([2.5]), setting, None, RECEDING
 
 
-CASES = {"kunita": kunita, "wing": wing, "butterflies": butterflies, "cell": cell, "gbm": gbm, "rounds": rounds}
+CASES = {
+    "kunita": kunita,
+    "wing": wing,
+    "butterflies": butterflies,
+    "cell": cell,
+    "gbm": gbm,
+    "rounds": rounds,
+}
 
 
 def measure(bridge, num_particles: int) -> dict:
@@ -180,7 +201,9 @@ def measure(bridge, num_particles: int) -> dict:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="50 particles")
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
@@ -191,5 +214,10 @@ if __name__ == "__main__":
         for name, sde, condition, setting, reference, guides in CASES[case]():
             for guide_name, (guide, solver) in guides.items():
                 bridge = nb.GuidedBridge(sde, condition, guide=guide, solver=solver, **setting)
-                row = {"case": name, "guide": guide_name, "reference": reference, **measure(bridge, particles)}
+                row = {
+                    "case": name,
+                    "guide": guide_name,
+                    "reference": reference,
+                    **measure(bridge, particles),
+                }
                 print(json.dumps(row), flush=True)

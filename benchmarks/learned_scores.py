@@ -2,13 +2,15 @@
 
 Parts, each JSON lines (seconds of training hold the compilation):
 
-- `ou`: dX = −X dt + dW in dimension d over time T, guided by Brownian motion: mean squared and relative error of
-  ∇log h against the closed form, on exact bridges.
-- `evidence`: log evidence of guided and learned bridges: do they agree within 3 joint standard errors (null where that
-  cannot be known), and what is the ESS?
+- `ou`: dX = −X dt + dW in dimension d over time T, guided by Brownian motion: mean squared and
+  relative error of ∇log h against the closed form, on exact bridges.
+- `evidence`: log evidence of guided and learned bridges: do they agree within 3 joint standard
+  errors (null where that cannot be known), and what is the ESS?
 - `kunita`: 8 landmarks: error of ∇log h against nested simulation of the unconditioned flow.
-- `points`: trained at 32 landmarks, used at 128: error of the score against nested guided bridges at both.
-- `amortised`: one guide for all parameters inside MCMC on a real wing: the same posterior, effective draws a second.
+- `points`: trained at 32 landmarks, used at 128: error of the score against nested guided bridges
+  at both.
+- `amortised`: one guide for all parameters inside MCMC on a real wing: the same posterior,
+  effective draws a second.
 
     python benchmarks/learned_scores.py                      # an hour
     python benchmarks/learned_scores.py --parts ou --quick
@@ -37,7 +39,10 @@ METHODS = ("residual", "adjoint", "reversal")
 
 
 def show(**row):
-    print(json.dumps({k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()}), flush=True)
+    print(
+        json.dumps({k: round(v, 6) if isinstance(v, float) else v for k, v in row.items()}),
+        flush=True,
+    )
 
 
 def trained(bridge, method, training, **settings):
@@ -66,7 +71,9 @@ def paths_of(bridge, key, num):
 
 
 def score_errors(bridge, truth, paths, weights):
-    """Mean squared error of a coordinate, and relative error in the norm of a, over paths and grid times."""
+    """Mean squared error of a coordinate, and relative error in the norm of a, over paths and grid
+    times.
+    """
     times = bridge.ts[:-1]
 
     def one(t, x):
@@ -97,7 +104,9 @@ def ou(arguments):
             for method in arguments.methods:
                 learned, seconds = trained(start, method, arguments.training)
                 mse, relative = score_errors(learned, truth, paths, weights)
-                show(part="ou", d=d, T=T, method=method, mse=mse, relative=relative, seconds=seconds)
+                show(
+                    part="ou", d=d, T=T, method=method, mse=mse, relative=relative, seconds=seconds
+                )
 
 
 def hill(x):
@@ -115,7 +124,9 @@ def cases(quick):
         return jnp.stack([(x[0] - x[1] - x[0] ** 3) / 0.1, 1.5 * x[0] - x[1] + 0.8])
 
     def build(sde, condition, x0, t1, num_steps, guide=None):
-        return nb.GuidedBridge(sde, condition, x0=jnp.asarray(x0), t1=t1, num_steps=num_steps, guide=guide)
+        return nb.GuidedBridge(
+            sde, condition, x0=jnp.asarray(x0), t1=t1, num_steps=num_steps, guide=guide
+        )
 
     cells = nb.SDE(cell, lambda t, x, a: 0.1)
     aux = nb.FrozenGuide(nb.LinearSDE(-1.0, 0.1, jnp.array([2.0, 0.0])))
@@ -128,8 +139,16 @@ def cases(quick):
     if quick:
         return
     yield "sine", METHODS, build(wait_and_jump, level, [0.0], 1.0, 100)
-    yield "cell", METHODS, build(cells, nb.ExactMatch().at(jnp.array([2.0, -0.1])), [0.1, -0.1], 4.0, 400, aux)
-    yield "cell, rare", METHODS, build(cells, nb.ExactMatch().at(jnp.array([1.0, -0.1])), [0.1, -0.1], 4.0, 400, rare)
+    yield (
+        "cell",
+        METHODS,
+        build(cells, nb.ExactMatch().at(jnp.array([2.0, -0.1])), [0.1, -0.1], 4.0, 400, aux),
+    )
+    yield (
+        "cell, rare",
+        METHODS,
+        build(cells, nb.ExactMatch().at(jnp.array([1.0, -0.1])), [0.1, -0.1], 4.0, 400, rare),
+    )
     yield (
         "FitzHugh-Nagumo",
         ("residual",),
@@ -156,7 +175,11 @@ def evidence(arguments):
         guided = nb.estimate_evidence(bridge, jr.key(2), num_particles=arguments.particles)
         report(name, "guided", guided, guided)
         for method in (m for m in methods if m in arguments.methods):
-            batch = 16 if name == "Kunita 32" and method == "residual" else arguments.training.batch_size
+            batch = (
+                16
+                if name == "Kunita 32" and method == "residual"
+                else arguments.training.batch_size
+            )
             training = Training(arguments.updates, batch)
             learned, seconds = trained(bridge, method, training)
             found = nb.estimate_evidence(learned, jr.key(3), num_particles=arguments.particles)
@@ -181,7 +204,9 @@ def report(name, method, found, guided, **more):
 
 
 def simulated_score(bridge, num, key):
-    """(t, x) ↦ ∇log h by unconditioned paths from x: ∇ log of the mean density of what is seen, pathwise."""
+    """(t, x) ↦ ∇log h by unconditioned paths from x: ∇ log of the mean density of what is seen,
+    pathwise.
+    """
     seen, _ = bridge.end()
     observed, ts = bridge.observed(), bridge.ts
 
@@ -194,7 +219,9 @@ def simulated_score(bridge, num, key):
                 law = bridge.sde.transition(t0, t1, x)
                 return jnp.where(on, law.mean + law.factor @ z, x), None
 
-            x_end, _ = jax.lax.scan(step, x, (ts[:-1], ts[1:], z, jnp.arange(bridge.num_steps) >= k))
+            x_end, _ = jax.lax.scan(
+                step, x, (ts[:-1], ts[1:], z, jnp.arange(bridge.num_steps) >= k)
+            )
             factor = seen.factor if seen.factor.ndim == 0 else seen.factor[:, None]
             gap = (observed - x_end) / factor
             return -0.5 * jnp.sum(gap**2)
@@ -211,11 +238,16 @@ def kunita(arguments):
     start = np.stack([np.cos(s), np.sin(s)], 1)
     end = np.stack([1.1 * np.cos(s) + 0.1, 0.9 * np.sin(s) - 0.1], 1)
     flow = nb.KunitaFlow(nb.Landmarks(n, 2), nb.GaussianKernel(0.3, 0.5))
-    bridge = nb.GuidedBridge(flow, nb.InexactMatch(0.1 / n).at(end), x0=jnp.asarray(start), t1=1.0, num_steps=25)
+    bridge = nb.GuidedBridge(
+        flow, nb.InexactMatch(0.1 / n).at(end), x0=jnp.asarray(start), t1=1.0, num_steps=25
+    )
     gradient, key = simulated_score(bridge, num, jr.key(7))
     paths, _ = paths_of(bridge, jr.key(0), 8)
     where = [(k, paths[i, k]) for i in range(2 if arguments.quick else 8) for k in (0, 12, 20)]
-    halves = [[gradient(x, k, jr.fold_in(key, 2 * i + j)) for j in (0, 1)] for i, (k, x) in enumerate(where)]
+    halves = [
+        [gradient(x, k, jr.fold_in(key, 2 * i + j)) for j in (0, 1)]
+        for i, (k, x) in enumerate(where)
+    ]
 
     def relative(score):
         """Products of the errors to two independent referees: unbiased for the squared error."""
@@ -227,7 +259,9 @@ def kunita(arguments):
         return error / size
 
     for method in ("guided", *arguments.methods):
-        learned, seconds = (bridge, 0.0) if method == "guided" else trained(bridge, method, arguments.training)
+        learned, seconds = (
+            (bridge, 0.0) if method == "guided" else trained(bridge, method, arguments.training)
+        )
         score = jax.jit(learned.score)
         error = relative(lambda k, x, score=score: score(bridge.ts[k], x))
         show(part="kunita", method=method, relative=error, seconds=seconds)
@@ -236,7 +270,9 @@ def kunita(arguments):
 
 
 def points(arguments):
-    """The score of a fine guided bridge is the gradient of its estimated log evidence, from each state."""
+    """The score of a fine guided bridge is the gradient of its estimated log evidence, from each
+    state.
+    """
 
     def bridge_at(n, guide=None):
         s = 2 * np.pi * np.arange(n) / n
@@ -244,7 +280,9 @@ def points(arguments):
         end = np.stack([1.3 * np.cos(s) + 0.1 + 0.05 * np.cos(3 * s), 0.8 * np.sin(s) - 0.2], 1)
         flow = nb.KunitaFlow(nb.Landmarks(n, 2), nb.GaussianKernel(0.3, 0.5))
         condition = nb.InexactMatch(3e-4).at(end)
-        return nb.GuidedBridge(flow, condition, x0=jnp.asarray(start), t1=1.0, num_steps=25, guide=guide)
+        return nb.GuidedBridge(
+            flow, condition, x0=jnp.asarray(start), t1=1.0, num_steps=25, guide=guide
+        )
 
     sizes = (8, 16) if arguments.quick else (32, 128)
     learned, seconds = trained(bridge_at(sizes[0]), "residual", Training(arguments.updates, 16))
@@ -285,7 +323,9 @@ def points(arguments):
 
 
 def amortised(arguments):
-    """FunctionSpaceHMC on one real wing, amplitude and length scale unknown, by a guide and by a learned one."""
+    """FunctionSpaceHMC on one real wing, amplitude and length scale unknown, by a guide and by a
+    learned one.
+    """
     n, num_steps = (8, 10) if arguments.quick else (32, 50)
     wings = nb.datasets.mosquito_wings(num_points=n, genus="CX")
     space, seen = nb.Landmarks(n, 2), nb.InexactMatch.from_point_sd(0.005, nb.Landmarks(n, 2))
@@ -303,10 +343,16 @@ def amortised(arguments):
     def context(sde):
         return jnp.log(jnp.stack([sde.kernel.amplitude, sde.kernel.length_scale]))
 
-    bridge = nb.GuidedBridge(*draw(jr.key(0))[:2], x0=jnp.asarray(wings.mean), t1=1.0, num_steps=num_steps)
+    bridge = nb.GuidedBridge(
+        *draw(jr.key(0))[:2], x0=jnp.asarray(wings.mean), t1=1.0, num_steps=num_steps
+    )
     training = Training(arguments.updates, 16)
     learned, seconds = trained(bridge, "residual", training, draw=draw, context=context)
-    show(part="amortised", training_seconds=seconds, ess=[float(v) for v in learned.guide.history["ess"]])
+    show(
+        part="amortised",
+        training_seconds=seconds,
+        ess=[float(v) for v in learned.guide.history["ess"]],
+    )
     posterior = {}
     for name, guide in (("guided", None), ("amortised", learned.guide)):
 
@@ -314,7 +360,12 @@ def amortised(arguments):
             amplitude = numpyro.sample("amplitude", dist.LogNormal(-2.0, 1.0))
             length_scale = numpyro.sample("length_scale", dist.LogNormal(-1.0, 0.5))
             law = nb.DiffusionEndpoint(
-                flow(amplitude, length_scale), wings.mean, seen, t1=1.0, num_steps=num_steps, guide=guide
+                flow(amplitude, length_scale),
+                wings.mean,
+                seen,
+                t1=1.0,
+                num_steps=num_steps,
+                guide=guide,
             )
             nb.sample("wing", law, obs=observed)
 
@@ -329,7 +380,12 @@ def amortised(arguments):
             x = np.log(np.asarray(samples[site], float))
             ess = float(numpyro.diagnostics.effective_sample_size(x))
             posterior[name, site] = (x.mean(), x.std() / np.sqrt(ess))
-            row = {"mean_log": float(x.mean()), "sd_log": float(x.std()), "ess": ess, "ess_per_s": ess / run}
+            row = {
+                "mean_log": float(x.mean()),
+                "sd_log": float(x.std()),
+                "ess": ess,
+                "ess_per_s": ess / run,
+            }
             r_hat = float(numpyro.diagnostics.split_gelman_rubin(x))
             show(part="amortised", guide=name, site=site, **row, r_hat=r_hat, seconds=run)
     for site in ("amplitude", "length_scale"):
@@ -344,7 +400,9 @@ if __name__ == "__main__":
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--cases", nargs="+", help="of `evidence`; all by default")
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS, help="of all but two parts")
+    parser.add_argument(
+        "--methods", nargs="+", default=list(METHODS), choices=METHODS, help="of all but two parts"
+    )
     parser.add_argument("--updates", type=int, default=1500)
     parser.add_argument("--particles", type=int, default=8192)
     arguments = parser.parse_args()

@@ -1,14 +1,15 @@
 """How many effective draws of the parameters does each kernel make, a second and a gradient?
 
-Real wings (32 points) that evolved from their mean, amplitude and length scale unknown: one specimen, and eight, on 50
-to 400 time steps. JSON lines: bulk ESS of the worse parameter, and its ratio to NUTS in the same run; compile and run
-time apart. Where R-hat is not below 1.01 in time, `converged` is false, and the figures are not to be trusted.
+Real wings (32 points) that evolved from their mean, amplitude and length scale unknown: one
+specimen, and eight, on 50 to 400 time steps. JSON lines: bulk ESS of the worse parameter, and its
+ratio to NUTS in the same run; compile and run time apart. Where R-hat is not below 1.01 in time,
+`converged` is false, and the figures are not to be trusted.
 
-    python benchmarks/mcmc.py                     # hours
-    python benchmarks/mcmc.py --quick             # a minute, to see that all runs
-    python benchmarks/mcmc.py --steps 100 --specimens 1 --kernels nuts function-space-hmc
-    python benchmarks/mcmc.py --chains-cost       # four vectorised chains against one
-    python benchmarks/mcmc.py --mesh mesh.png     # acceptance at a fixed step, on finer and finer grids
+    python benchmarks/mcmc.py                     # hours python benchmarks/mcmc.py --quick
+    # a minute, to see that all runs python benchmarks/mcmc.py --steps 100 --specimens 1 --kernels
+    nuts function-space-hmc python benchmarks/mcmc.py --chains-cost       # four vectorised chains
+    against one python benchmarks/mcmc.py --mesh mesh.png     # acceptance at a fixed step, on finer
+    and finer grids
 """
 
 import argparse
@@ -35,7 +36,8 @@ PARAMETERS = ("amplitude", "length_scale")
 def wing_model(num_points, num_steps, num_specimens):
     wings = nb.datasets.mosquito_wings(num_points=num_points, genus="CX")
     space = nb.Landmarks(num_points, 2)
-    seen = nb.InexactMatch(0.005**2 / 32)  # of the H-norm, one likelihood on every mesh; 0.005 a point at 32 points
+    # of the H-norm, one likelihood on every mesh; 0.005 a point at 32 points
+    seen = nb.InexactMatch(0.005**2 / 32)
 
     def model(observed):
         amplitude = numpyro.sample("amplitude", dist.LogNormal(-2.0, 1.0))
@@ -52,9 +54,14 @@ def kernels(model):
     dense = [PARAMETERS]
     return {
         "nuts": lambda: NUTS(model, init_strategy=init_to_median, dense_mass=dense),
-        "nuts-0.65": lambda: NUTS(model, init_strategy=init_to_median, dense_mass=dense, target_accept_prob=0.65),
+        "nuts-0.65": lambda: NUTS(
+            model, init_strategy=init_to_median, dense_mass=dense, target_accept_prob=0.65
+        ),
         "gibbs-pcn-nuts": lambda: Gibbs(
-            [(PCN(model), noise_sites), (NUTS(model, init_strategy=init_to_median, dense_mass=dense), None)]
+            [
+                (PCN(model), noise_sites),
+                (NUTS(model, init_strategy=init_to_median, dense_mass=dense), None),
+            ]
         ),
         "function-space-hmc": lambda: FunctionSpaceHMC(model),
         "pseudo-marginal": lambda: CorrelatedPseudoMarginal(model),
@@ -78,8 +85,14 @@ def measure(name, kernel, data, arguments):
             state = kernel.sample(state, (data,), {})
             return state, ({k: state.z[k] for k in PARAMETERS}, gradients(state))
 
-        advance = jax.jit(lambda state, step=step: jax.lax.scan(step, state, length=25)).lower(state).compile()
-        chains.append({"advance": advance, "state": state, "draws": [], "gradients": 0, "seconds": 0.0})
+        advance = (
+            jax.jit(lambda state, step=step: jax.lax.scan(step, state, length=25))
+            .lower(state)
+            .compile()
+        )
+        chains.append(
+            {"advance": advance, "state": state, "draws": [], "gradients": 0, "seconds": 0.0}
+        )
     compile_s = (time.perf_counter() - start) / 2
 
     def run(chain):
@@ -94,9 +107,16 @@ def measure(name, kernel, data, arguments):
             chain["seconds"] += seconds
             chain["gradients"] += count
             chain["draws"].append(draws)
-        x = {p: np.stack([np.concatenate([d[p] for d in c["draws"]]) for c in chains]) for p in PARAMETERS}
+        x = {
+            p: np.stack([np.concatenate([d[p] for d in c["draws"]]) for c in chains])
+            for p in PARAMETERS
+        }
         seconds = sum(c["seconds"] for c in chains)
-        r_hat = max(float(split_gelman_rubin(v)) for v in x.values()) if x[PARAMETERS[0]].shape[1] > 3 else np.inf
+        r_hat = (
+            max(float(split_gelman_rubin(v)) for v in x.values())
+            if x[PARAMETERS[0]].shape[1] > 3
+            else np.inf
+        )
         ess = min(bulk_ess(v) for v in x.values())
         enough = r_hat < 1.01 and ess > 400 and len(x[PARAMETERS[0]][0]) >= arguments.least_draws
         if enough or seconds > 60 * arguments.minutes:
@@ -136,7 +156,8 @@ def seconds_of_a_draw(kernel, state, *data):
     def advance(state):
         return jax.lax.fori_loop(0, 50, lambda _, state: kernel.sample(state, data, {}), state)
 
-    state = jax.block_until_ready(advance(advance(state)))  # twice: what it returns may be laid out otherwise
+    # twice: what it returns may be laid out otherwise
+    state = jax.block_until_ready(advance(advance(state)))
     begin = time.perf_counter()
     jax.block_until_ready(advance(state))
     return (time.perf_counter() - begin) / 50
@@ -151,14 +172,22 @@ def chains_cost(arguments):
         kernel = FunctionSpaceHMC(model, adapt_step_size=False)
         state = kernel.init(jr.key(0) if n == 1 else jr.split(jr.key(0), n), 0, None, (data,), {})
         seconds[n] = 50 * seconds_of_a_draw(kernel, state, data)
-    row = {"devices": jax.local_device_count(), "seconds": seconds, "ratio": seconds[4] / seconds[1]}
+    row = {
+        "devices": jax.local_device_count(),
+        "seconds": seconds,
+        "ratio": seconds[4] / seconds[1],
+    }
     print(json.dumps(row | {"jax": jax.__version__}))
 
 
 def mesh(arguments):
-    """Acceptance at a fixed step: of FunctionSpaceHMC and PCN, and of plain HMC with as long a trajectory."""
+    """Acceptance at a fixed step: of FunctionSpaceHMC and PCN, and of plain HMC with as long a
+    trajectory.
+    """
     rows = []
-    for num_points, num_steps in [(32, k) for k in arguments.mesh_steps] + [(n, 50) for n in arguments.mesh_points]:
+    for num_points, num_steps in [(32, k) for k in arguments.mesh_steps] + [
+        (n, 50) for n in arguments.mesh_points
+    ]:
         model, data = wing_model(num_points, num_steps, 1)
         fixed = {"amplitude": 0.036, "length_scale": 0.44}
         noise_only = numpyro.handlers.condition(model, fixed)
@@ -166,7 +195,9 @@ def mesh(arguments):
         for name, kernel in {
             "FunctionSpaceHMC": FunctionSpaceHMC(model, step_size=1.0, **step),
             "PCN": PCN(noise_only, angle=0.8, adapt_angle=False),
-            "HMC": HMC(noise_only, step_size=0.25, trajectory_length=2.0, adapt_mass_matrix=False, **step),
+            "HMC": HMC(
+                noise_only, step_size=0.25, trajectory_length=2.0, adapt_mass_matrix=False, **step
+            ),
         }.items():
             state = kernel.init(jr.key(0), 100, None, (data,), {})
 
@@ -180,7 +211,14 @@ def mesh(arguments):
 
             rate = np.asarray(run(state))[100:]
             error = rate.std() / np.sqrt(max(float(effective_sample_size(rate[None])), 2.0))
-            rows.append({"points": num_points, "steps": num_steps, "kernel": name, "acceptance": float(rate.mean())})
+            rows.append(
+                {
+                    "points": num_points,
+                    "steps": num_steps,
+                    "kernel": name,
+                    "acceptance": float(rate.mean()),
+                }
+            )
             print(json.dumps(rows[-1] | {"standard_error": float(error)}), flush=True)
     plot_mesh(rows, arguments.mesh)
 
@@ -192,11 +230,22 @@ def plot_mesh(rows, path):
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), sharey=True)
-    for axis, varies, other, fixed in ((axes[0], "steps", "points", 32), (axes[1], "points", "steps", 50)):
+    for axis, varies, other, fixed in (
+        (axes[0], "steps", "points", 32),
+        (axes[1], "points", "steps", 50),
+    ):
         for name in dict.fromkeys(row["kernel"] for row in rows):
-            chosen = sorted((r[varies], r["acceptance"]) for r in rows if r["kernel"] == name and r[other] == fixed)
+            chosen = sorted(
+                (r[varies], r["acceptance"])
+                for r in rows
+                if r["kernel"] == name and r[other] == fixed
+            )
             axis.plot(*zip(*chosen, strict=True), marker="o", label=name)
-        axis.set(xscale="log", xlabel={"steps": "time steps", "points": "landmarks"}[varies], ylim=(0, 1.02))
+        axis.set(
+            xscale="log",
+            xlabel={"steps": "time steps", "points": "landmarks"}[varies],
+            ylim=(0, 1.02),
+        )
         ticks = sorted({row[varies] for row in rows if row[other] == fixed})
         axis.set_xticks(ticks, map(str, ticks))
         axis.minorticks_off()
@@ -213,7 +262,9 @@ if __name__ == "__main__":
     parser.add_argument("--specimens", type=int, nargs="+", default=[1, 8])
     parser.add_argument("--kernels", nargs="+")
     parser.add_argument("--warmup", type=int, default=200)
-    parser.add_argument("--minutes", type=float, default=30.0, help="for each kernel, after its warm-up")
+    parser.add_argument(
+        "--minutes", type=float, default=30.0, help="for each kernel, after its warm-up"
+    )
     parser.add_argument("--least-draws", type=int, default=200, help="of each chain")
     parser.add_argument("--chains-cost", action="store_true")
     parser.add_argument("--devices", type=int, default=2, help="of --chains-cost")
@@ -223,7 +274,12 @@ if __name__ == "__main__":
     parser.add_argument("--draws", type=int, default=400, help="of --mesh")
     arguments = parser.parse_args()
     if arguments.quick:
-        arguments.steps, arguments.specimens, arguments.warmup, arguments.minutes = [10], [1], 25, 0.1
+        arguments.steps, arguments.specimens, arguments.warmup, arguments.minutes = (
+            [10],
+            [1],
+            25,
+            0.1,
+        )
         arguments.kernels = arguments.kernels or ["gibbs-pcn-nuts", "function-space-hmc"]
     if arguments.chains_cost:
         chains_cost(arguments)

@@ -1,11 +1,13 @@
 """What does a guided weight cost as the number of landmarks grows, beside noise of all landmarks?
 
-    python benchmarks/scale.py [--sizes 32 128 1000] [--length-scales 0.4 0.1] [--guides GeodesicGuide]
+    python benchmarks/scale.py [--sizes 32 128 1000] [--length-scales 0.4 0.1] [--guides
+    GeodesicGuide]
 
-One path of 100 steps between two outlines of diameter 2.5, controls by a tolerance of 1e-3, one core: value, and
-gradient with respect to the noise, the amplitude and the length scale. A JSON line for each size: seconds (the minimum
-over repeats), of landmark noise too up to 256 points, the ratios, seconds of compilation, and the exponent of the time
-from the size before. `--memory`: of one size, the peak memory of the process after each program.
+One path of 100 steps between two outlines of diameter 2.5, controls by a tolerance of 1e-3, one
+core: value, and gradient with respect to the noise, the amplitude and the length scale. A JSON line
+for each size: seconds (the minimum over repeats), of landmark noise too up to 256 points, the
+ratios, seconds of compilation, and the exponent of the time from the size before. `--memory`: of
+one size, the peak memory of the process after each program.
 """
 
 import argparse
@@ -38,7 +40,9 @@ def weight(n: int, length_scale: float, noise, guide: str):
     x0, v = outlines(n)
 
     def log_weight(parameters, z):
-        flow = nb.KunitaFlow(nb.Landmarks(n, 2), covariance=nb.GaussianKernel(*parameters), noise=noise)
+        flow = nb.KunitaFlow(
+            nb.Landmarks(n, 2), covariance=nb.GaussianKernel(*parameters), noise=noise
+        )
         match = nb.InexactMatch.from_point_sd(0.01, flow.space)
         bridge = nb.GuidedBridge(
             flow, match.at(v), x0=x0, t1=1.0, num_steps=NUM_STEPS, guide=getattr(nb, guide)()
@@ -97,7 +101,9 @@ if __name__ == "__main__":
     parser.add_argument("--length-scales", type=float, nargs="+", default=[0.4])
     parser.add_argument("--guides", nargs="+", default=["GeodesicGuide", "RecedingGuide"])
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--memory", action="store_true", help="no landmark noise: peak memory after each program")
+    parser.add_argument(
+        "--memory", action="store_true", help="no landmark noise: peak memory after each program"
+    )
     arguments = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # one core

@@ -1,35 +1,44 @@
-"""How well is the score of Brownian motion between shapes learned, and how fast, beside the published recipe?
+"""How well is the score of Brownian motion between shapes learned, and how fast, beside the
+published recipe?
 
-    python benchmarks/score_table.py [--quick] [--cells landmarks-8 fourier-32] [--conditions exact inexact]
-                                     [--methods reversal adjoint residual] [--epochs 10] [--output DIR]
-    python benchmarks/score_table.py --freeze FILE [--budget SECONDS]     the reference's curves alone
+    python benchmarks/score_table.py [--quick] [--cells landmarks-8 fourier-32] [--conditions exact
+    inexact]
+                                     [--methods reversal adjoint residual] [--epochs 10] [--output
+                                     DIR]
+    python benchmarks/score_table.py --freeze FILE [--budget SECONDS]     the reference's curves
+    alone
 
-The published table (Baker, Yang, Severinsen, Hipsley and Sommer 2024): the unit circle is start and target, T = 1,
-dX = 0.1 dW in every coordinate, 100 steps of one length. N landmarks, or the 2N + 1 real functions of
-`FourierBasis(N, 2)` (published: N complex numbers a coordinate). The inexact condition has a point SD of 0.05: its
-variance is 0.0025 for each coordinate of a landmark, or each coefficient.
+The published table (Baker, Yang, Severinsen, Hipsley and Sommer 2024): the unit circle is start and
+target, T = 1, dX = 0.1 dW in every coordinate, 100 steps of one length. N landmarks, or the 2N + 1
+real functions of `FourierBasis(N, 2)` (published: N complex numbers a coordinate). The inexact
+condition has a point SD of 0.05: its variance is 0.0025 for each coordinate of a landmark, or each
+coefficient.
 
-One JSON line per cell, condition, method and setting (rows that DIR already has of others are kept):
+One JSON line per cell, condition, method and setting (rows that DIR already has of others are
+kept):
 
-- `published_rmse`: root mean square of trained minus true score at x = x0 = target, over times, points and coordinates.
-  The true score is 0 there, so a network that says 0 has none.
-- `error`: E|s − s*|²_a / E|s*|²_a, over times and paths from the target run backwards, which are the law that score
-  matching is trained on; `error_on_bridges`: the same over bridges. s* = (v − x)/(σ² (T − t) + noise variance). Fourier
-  scores are compared on 100 points of the curve.
-- `seconds`: updates and looks at held-out paths, without compilation; `cpu_seconds`: of the processor, which says more
-  where several programs share it. `steps_per_second`: trajectories × steps used, by `cpu_seconds`.
-- `reference`: the published recipe in the same run: its throughput, its seconds for all the epochs of the published
-  table, and its error when it has trained for as long as the row's. The mirror image of its pass over unconditioned
-  paths from the target is `method="adjoint"`, as Brownian motion and its adjoint are one process; so it is that method,
-  with the published network, schedule, batches and one-step targets, and no guide. Its input is standardised and its
-  output is in units of 1/σ, as for every network here: it learns faster so than from the raw state to the raw score,
-  whose error was still 0.99 after 15 epochs at 8 landmarks. `score_table_reference.json` has its curves as they were
-  frozen before anything else was tuned: 0.36 after 40 epochs at 8 landmarks. The published rate is small: with
-  `--rate 1e-3` the same recipe has 0.11 after 20 epochs and 0.044 after 40.
+- `published_rmse`: root mean square of trained minus true score at x = x0 = target, over times,
+  points and coordinates. The true score is 0 there, so a network that says 0 has none.
+- `error`: E|s − s*|²_a / E|s*|²_a, over times and paths from the target run backwards, which are
+  the law that score matching is trained on; `error_on_bridges`: the same over bridges. s* = (v −
+  x)/(σ² (T − t) + noise variance). Fourier scores are compared on 100 points of the curve.
+- `seconds`: updates and looks at held-out paths, without compilation; `cpu_seconds`: of the
+  processor, which says more where several programs share it. `steps_per_second`: trajectories ×
+  steps used, by `cpu_seconds`.
+- `reference`: the published recipe in the same run: its throughput, its seconds for all the epochs
+  of the published table, and its error when it has trained for as long as the row's. The mirror
+  image of its pass over unconditioned paths from the target is `method="adjoint"`, as Brownian
+  motion and its adjoint are one process; so it is that method, with the published network,
+  schedule, batches and one-step targets, and no guide. Its input is standardised and its output is
+  in units of 1/σ, as for every network here: it learns faster so than from the raw state to the raw
+  score, whose error was still 0.99 after 15 epochs at 8 landmarks. `score_table_reference.json` has
+  its curves as they were frozen before anything else was tuned: 0.36 after 40 epochs at 8
+  landmarks. The published rate is small: with `--rate 1e-3` the same recipe has 0.11 after 20
+  epochs and 0.044 after 40.
 
-Settings: `guide` corrects the default guide, which is the true score here, so it shows only that training spoils
-nothing; `nothing` learns all of the score with `Unguided()` and a network whose singular part near the end is
-`Singular`. "residual" has the first setting only.
+Settings: `guide` corrects the default guide, which is the true score here, so it shows only that
+training spoils nothing; `nothing` learns all of the score with `Unguided()` and a network whose
+singular part near the end is `Singular`. "residual" has the first setting only.
 """
 
 import argparse
@@ -79,7 +88,11 @@ class Cell:
             self.on_curve = jnp.asarray(space.basis(np.linspace(0, 2 * np.pi, 100, endpoint=False)))
             circle = np.zeros((space.size, 2))
             circle[1, 0] = circle[2, 1] = np.sqrt(0.5)
-        match = nb.ExactMatch() if condition == "exact" else nb.InexactMatch.from_point_sd(POINT_SD, space)
+        match = (
+            nb.ExactMatch()
+            if condition == "exact"
+            else nb.InexactMatch.from_point_sd(POINT_SD, space)
+        )
         self.target = jnp.asarray(circle)
         self.variance = jnp.asarray(0.0 if condition == "exact" else POINT_SD**2)
         self.problem = {
@@ -90,7 +103,10 @@ class Cell:
         }
         problem = dict(self.problem)
         self.bridge = nb.GuidedBridge(problem.pop("sde"), problem.pop("condition"), **problem)
-        self.paths = {"error": self._backwards(jr.key(11)), "error_on_bridges": self._bridges(jr.key(12))}
+        self.paths = {
+            "error": self._backwards(jr.key(11)),
+            "error_on_bridges": self._bridges(jr.key(12)),
+        }
 
     def _backwards(self, key, num_paths: int = 64):
         """Unconditioned paths from the datum, at all times but the last, `(num_paths, K, n, 2)`."""
@@ -101,10 +117,13 @@ class Cell:
         return self.target + (start + jnp.cumsum(moves, axis=1))[:, ::-1]
 
     def _bridges(self, key, num_paths: int = 64):
-        return jax.vmap(self.bridge.path)(jr.normal(key, (num_paths, *self.bridge.noise_shape)))[:, :-1]
+        return jax.vmap(self.bridge.path)(jr.normal(key, (num_paths, *self.bridge.noise_shape)))[
+            :, :-1
+        ]
 
     def errors(self, guide) -> dict[str, float]:
-        guide = nb.ScoreGuide(guide.guide, guide.network, guide.standard)  # its history grows: compiled once without
+        # its history grows: compiled once without
+        guide = nb.ScoreGuide(guide.guide, guide.network, guide.standard)
         found = _errors(guide, self.bridge, self.paths, self.on_curve, self.variance)
         return {name: float(value) for name, value in found.items()}
 
@@ -134,7 +153,9 @@ class Enough(Exception):
 
 
 class Watch:
-    """Errors against training time, the time of the errors' evaluation apart; stops at a number of seconds."""
+    """Errors against training time, the time of the errors' evaluation apart; stops at a number of
+    seconds.
+    """
 
     def __init__(self, cell: Cell, name: str, most: float = np.inf):
         self.cell, self.name, self.most = cell, name, most
@@ -149,7 +170,11 @@ class Watch:
             self.spent = self.spent + now - self.stamp
             self.updates += update - int(guide.history["update"][-2])
         if name == self.name:
-            row = {"updates": self.updates, "seconds": float(self.spent[0]), "cpu_seconds": float(self.spent[1])}
+            row = {
+                "updates": self.updates,
+                "seconds": float(self.spent[0]),
+                "cpu_seconds": float(self.spent[1]),
+            }
             self.curve.append(row | self.cell.errors(guide))
         if self.spent[1] > self.most:
             raise Enough
@@ -191,7 +216,7 @@ def freeze(file: Path, cells, conditions, epochs, rate: float, budget: float):
     """The reference's curves over time, one cell after the other."""
     record: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"curves": {}}
     record |= {
-        "recipe": "UNet.published and Training.published of numpyro_bridges.scores, adjoint, Unguided",
+        "recipe": "UNet.published, Training.published of numpyro_bridges.scores, adjoint, Unguided",
         "jax": jax.__version__,
         "equinox": eqx.__version__,
         "machine": "2 CPU cores, one used; float32",
@@ -202,7 +227,9 @@ def freeze(file: Path, cells, conditions, epochs, rate: float, budget: float):
             watch = reference(cell, epochs or EPOCHS[name], rate, budget)
             rows = [{k: float(f"{v:.5g}") for k, v in row.items()} for row in watch.curve]
             columns = {k: [row[k] for row in rows] for k in rows[0]}
-            record["curves"][f"{name} {condition}"] = {"epochs_of_schedule": epochs or EPOCHS[name]} | columns
+            record["curves"][f"{name} {condition}"] = {
+                "epochs_of_schedule": epochs or EPOCHS[name]
+            } | columns
             file.write_text(json.dumps(record))
             print(json.dumps({"cell": name, "condition": condition, **rows[-1]}), flush=True)
 
@@ -213,7 +240,9 @@ def train(cell: Cell, method: str, setting: str, num_updates: int) -> dict:
     network = None
     if setting == "nothing":
         key_network, key_gain = jr.split(jr.key(2))
-        network = nb.scores.Singular(nb.scores.MLP((cell.target.shape[0], 2), key=key_network), key=key_gain)
+        network = nb.scores.Singular(
+            nb.scores.MLP((cell.target.shape[0], 2), key=key_network), key=key_gain
+        )
     watch = Watch(cell, method)
     begin = time.perf_counter()
     guide = nb.scores.fit(
@@ -252,7 +281,9 @@ def beside(row: dict, watch: Watch, epochs: int) -> dict:
     times = {clock: [r[clock] for r in watch.curve] for clock in ("seconds", "cpu_seconds")}
     whole = {clock: last[clock] / last["updates"] * UPDATES_PER_EPOCH * epochs for clock in times}
     after = {
-        name: float(np.interp(row["cpu_seconds"], times["cpu_seconds"], [r[name] for r in watch.curve]))
+        name: float(
+            np.interp(row["cpu_seconds"], times["cpu_seconds"], [r[name] for r in watch.curve])
+        )
         for name in ("error", "error_on_bridges", "published_rmse")
     }
     speed = last["updates"] * 50 * NUM_STEPS / last["cpu_seconds"]
@@ -284,13 +315,25 @@ def plot(rows, references, path):
 
     columns = min(3, len(references))
     lines = -(-len(references) // columns)
-    figure, axes = plt.subplots(lines, columns, figsize=(3.6 * columns, 2.6 * lines), sharey=True, squeeze=False)
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(3.6 * columns, 2.6 * lines), sharey=True, squeeze=False
+    )
     for axis, (name, curve) in zip(axes.flat, references.items(), strict=False):
-        axis.plot([r["cpu_seconds"] for r in curve], [r["error"] for r in curve], "k.-", label="published recipe")
+        axis.plot(
+            [r["cpu_seconds"] for r in curve],
+            [r["error"] for r in curve],
+            "k.-",
+            label="published recipe",
+        )
         for row in rows:
             if f"{row['cell']} {row['condition']}" == name and row["setting"] == "nothing":
                 spent = [r["cpu_seconds"] for r in row["curve"]]
-                axis.plot(spent, [r["error"] for r in row["curve"]], ".-", label=f"{row['method']}, from nothing")
+                axis.plot(
+                    spent,
+                    [r["error"] for r in row["curve"]],
+                    ".-",
+                    label=f"{row['method']}, from nothing",
+                )
         axis.axhline(0.01, color="0.7", lw=0.8)
         axis.set(xscale="log", yscale="log", title=name)
         axis.title.set_fontsize(8)
@@ -319,38 +362,65 @@ def main(arguments):
                 if (method, setting) != ("residual", "nothing")
             ]
             if not arguments.without_reference:
-                watch = reference(cell, epochs, arguments.rate, max(row["cpu_seconds"] for row in found))
+                watch = reference(
+                    cell, epochs, arguments.rate, max(row["cpu_seconds"] for row in found)
+                )
                 record["references"][f"{name} {condition}"] = watch.curve
                 found = [beside(row, watch, epochs) for row in found]
             for row in found:
                 record["rows"] = [r for r in record["rows"] if key(r) != key(row)] + [row]
-                print(json.dumps(rounded({k: v for k, v in row.items() if k != "curve"})), flush=True)
+                print(
+                    json.dumps(rounded({k: v for k, v in row.items() if k != "curve"})), flush=True
+                )
             file.write_text(json.dumps(record))
             if record["references"]:
                 plot(**record, path=arguments.output / "score_table.png")
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="one small cell")
     parser.add_argument("--cells", nargs="+", choices=EPOCHS, default=list(EPOCHS))
-    parser.add_argument("--conditions", nargs="+", choices=("exact", "inexact"), default=["exact", "inexact"])
+    parser.add_argument(
+        "--conditions", nargs="+", choices=("exact", "inexact"), default=["exact", "inexact"]
+    )
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
-    parser.add_argument("--settings", nargs="+", choices=("guide", "nothing"), default=["nothing", "guide"])
+    parser.add_argument(
+        "--settings", nargs="+", choices=("guide", "nothing"), default=["nothing", "guide"]
+    )
     parser.add_argument("--updates", type=int, default=400, help="of ours, at most")
-    parser.add_argument("--epochs", type=int, help="of the reference's schedule; as published by default")
-    parser.add_argument("--rate", type=float, default=1e-4, help="the reference's largest learning rate")
+    parser.add_argument(
+        "--epochs", type=int, help="of the reference's schedule; as published by default"
+    )
+    parser.add_argument(
+        "--rate", type=float, default=1e-4, help="the reference's largest learning rate"
+    )
     parser.add_argument("--without-reference", action="store_true", help="ours alone")
-    parser.add_argument("--freeze", type=Path, help="write the reference's curves here, and nothing else")
-    parser.add_argument("--budget", type=float, default=np.inf, help="seconds of the reference's training in a cell")
+    parser.add_argument(
+        "--freeze", type=Path, help="write the reference's curves here, and nothing else"
+    )
+    parser.add_argument(
+        "--budget", type=float, default=np.inf, help="seconds of the reference's training in a cell"
+    )
     parser.add_argument("--output", type=Path, default=Path("output"))
     arguments = parser.parse_args()
     if arguments.quick:
-        arguments.cells, arguments.conditions, arguments.methods = ["landmarks-2"], ["exact"], ["adjoint"]
+        arguments.cells, arguments.conditions, arguments.methods = (
+            ["landmarks-2"],
+            ["exact"],
+            ["adjoint"],
+        )
         arguments.settings, arguments.updates, arguments.epochs = ["nothing"], 20, 1
     if arguments.freeze:
         freeze(
-            arguments.freeze, arguments.cells, arguments.conditions, arguments.epochs, arguments.rate, arguments.budget
+            arguments.freeze,
+            arguments.cells,
+            arguments.conditions,
+            arguments.epochs,
+            arguments.rate,
+            arguments.budget,
         )
     else:
         main(arguments)

@@ -2,13 +2,16 @@
 
     python benchmarks/semilinear.py [--quick] [--cases heat allen_cahn]
 
-- **heat**: the stochastic heat equation on the circle, λ_n = 0.5 + 0.1 n², with noise spectra q_n = (1 + n²)^-s, s = 1
-  and 2, from one curve to another, inexact with variance 0.01 and the kernel of the H-norm: log evidence at 16 to 4096
-  modes less its limit, to be of the size of what is left of the trace; by 1 and by 20 steps.
-- **allen_cahn**: dX = (0.1 Δ X + X − X³) dt + dW, q_n = 0.04 (1 + n²)⁻², variance 0.01: log evidence and SD of the log
-  weight by functions and by steps; at 4 modes and variance 0.1 beside paths that nothing guides.
+- **heat**: the stochastic heat equation on the circle, λ_n = 0.5 + 0.1 n², with noise spectra q_n =
+  (1 + n²)^-s, s = 1 and 2, from one curve to another, inexact with variance 0.01 and the kernel of
+  the H-norm: log evidence at 16 to 4096 modes less its limit, to be of the size of what is left of
+  the trace; by 1 and by 20 steps.
+- **allen_cahn**: dX = (0.1 Δ X + X − X³) dt + dW, q_n = 0.04 (1 + n²)⁻², variance 0.01: log
+  evidence and SD of the log weight by functions and by steps; at 4 modes and variance 0.1 beside
+  paths that nothing guides.
 
-One JSON line for each row: `seconds` of one run of all paths, without compilation. All in double precision.
+One JSON line for each row: `seconds` of one run of all paths, without compilation. All in double
+precision.
 """
 
 import argparse
@@ -29,7 +32,9 @@ import numpyro_bridges as nb
 def curves(space):
     """A start and an end, of the three lowest frequencies."""
     s = space.grid
-    return space.from_points(0.5 * np.cos(s)), space.from_points(0.3 + 0.8 * np.sin(s) + 0.1 * np.cos(3 * s))
+    return space.from_points(0.5 * np.cos(s)), space.from_points(
+        0.3 + 0.8 * np.sin(s) + 0.1 * np.cos(3 * s)
+    )
 
 
 def allen_cahn(
@@ -84,7 +89,10 @@ def show_heat(quick: bool) -> None:
             left = np.sum((1.0 + n**2.0) ** -decay / (0.5 + 0.1 * n**2) / 0.01)
             row = {"case": "heat", "decay": decay, "modes": num_modes, "log_evidence": rows[1][1]}
             row |= {"less_limit": rows[1][1] - limit, "left_of_trace": float(left)}
-            row |= {"one_step_less_20": rows[1][1] - rows[20][1], "seconds_20_steps": round(rows[20][0], 4)}
+            row |= {
+                "one_step_less_20": rows[1][1] - rows[20][1],
+                "seconds_20_steps": round(rows[20][0], 4),
+            }
             print(json.dumps(row), flush=True)
 
 
@@ -101,18 +109,31 @@ def show_allen_cahn(quick: bool) -> None:
         bridge = allen_cahn(num_modes, num_steps, scheme)
         z = jr.normal(jr.key(0), (num_particles, *bridge.noise_shape))
         seconds, log_weights = seconds_of(bridge.log_weight, z)
-        row = {"case": "allen_cahn", "functions": 2 * num_modes + 1, "steps": num_steps, "scheme": scheme}
+        row = {
+            "case": "allen_cahn",
+            "functions": 2 * num_modes + 1,
+            "steps": num_steps,
+            "scheme": scheme,
+        }
         print(json.dumps(row | quality(log_weights) | {"seconds": round(seconds, 2)}), flush=True)
     for guide, num_particles in ((nb.FrozenGuide(rounds=2), 4000), (nb.Unguided(), 1_000_000)):
         bridge = allen_cahn(4, 100, variance=0.1, guide=guide)
         estimate = nb.estimate_evidence(bridge, jr.key(1), 2000 if quick else num_particles)
-        row = {"case": "allen_cahn, variance 0.1", "functions": 9, "steps": 100, "guide": type(guide).__name__}
+        row = {
+            "case": "allen_cahn, variance 0.1",
+            "functions": 9,
+            "steps": 100,
+            "guide": type(guide).__name__,
+        }
         print(json.dumps(row | quality(estimate.log_weights)), flush=True)
 
 
 def quality(log_weights) -> dict:
     weights = jnp.asarray(log_weights)
-    row = {"log_evidence": nb.weights.log_mean_exp(weights), "standard_error": nb.weights.standard_error(weights)}
+    row = {
+        "log_evidence": nb.weights.log_mean_exp(weights),
+        "standard_error": nb.weights.standard_error(weights),
+    }
     row |= {"ess_percent": 100 * nb.weights.effective_sample_size(weights) / len(weights)}
     row |= {"pareto_k": nb.weights.pareto_k(weights), "sd": jnp.std(weights)}
     return {name: round(float(value), 4) for name, value in row.items()}
@@ -121,7 +142,9 @@ def quality(log_weights) -> dict:
 CASES = {"heat": show_heat, "allen_cahn": show_allen_cahn}
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
     arguments = parser.parse_args()

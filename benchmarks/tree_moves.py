@@ -1,8 +1,8 @@
 """How should the noise of a tree be moved: as a whole, or branch by branch?
 
-A Kunita flow of 8 landmarks on a tree of 8 tips, 4 steps a branch, parameters fixed; four chains. JSON lines: ESS a
-second of the worst and the median ancestral coordinate and of the log density Ψ, evaluations of the model a second, and
-means of an ancestral coordinate, which must agree.
+A Kunita flow of 8 landmarks on a tree of 8 tips, 4 steps a branch, parameters fixed; four chains.
+JSON lines: ESS a second of the worst and the median ancestral coordinate and of the log density Ψ,
+evaluations of the model a second, and means of an ancestral coordinate, which must agree.
 
     python benchmarks/tree_moves.py [--quick]
 """
@@ -24,7 +24,9 @@ import numpyro_bridges as nb
 from numpyro_bridges.infer import PCN, PCNL, FunctionSpaceHMC
 
 jax.config.update("jax_enable_x64", True)
-TREE = nb.Tree.from_newick("(((a:1,b:1):.5,(c:1,d:1):.5):.5,((e:1,f:1):.5,(g:1,h:1):.5):.5);").scaled(0.5)
+TREE = nb.Tree.from_newick(
+    "(((a:1,b:1):.5,(c:1,d:1):.5):.5,((e:1,f:1):.5,(g:1,h:1):.5):.5);"
+).scaled(0.5)
 ANGLES = 2 * np.pi * np.arange(8) / 8
 CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES)], 1)
 LAW = nb.DiffusionTree(
@@ -81,7 +83,11 @@ def main():
             state = kernel.sample(state, (), {})
             return state, (state.z["tips_noise"], getattr(state, "num_steps", jnp.full((4,), 3)))
 
-        advance = jax.jit(lambda state, step=step: jax.lax.scan(step, state, length=20)).lower(state).compile()
+        advance = (
+            jax.jit(lambda state, step=step: jax.lax.scan(step, state, length=20))
+            .lower(state)
+            .compile()
+        )
         for _ in range(10):
             state, _ = advance(state)
         found, count, seconds = [], 0, 0.0
@@ -91,13 +97,24 @@ def main():
             seconds += time.perf_counter() - start
             count += int(np.sum(steps))
             found.append(watch(noise.reshape(-1, *noise.shape[2:])))
-        stacked = [[np.asarray(x).reshape(20, 4, *x.shape[1:]) for x in part] for part in zip(*found, strict=True)]
+        stacked = [
+            [np.asarray(x).reshape(20, 4, *x.shape[1:]) for x in part]
+            for part in zip(*found, strict=True)
+        ]
         states, log_density = (np.concatenate(part).swapaxes(0, 1) for part in stacked)
         own = ess(states)
-        line = {"kernel": name, "draws": 4 * draws, "seconds": seconds, "evaluations_per_s": count / seconds}
+        line = {
+            "kernel": name,
+            "draws": 4 * draws,
+            "seconds": seconds,
+            "evaluations_per_s": count / seconds,
+        }
         line |= {"worst_per_s": own.min() / seconds, "median_per_s": np.median(own) / seconds}
         line |= {"log_density_per_s": float(ess(log_density)[0]) / seconds}
-        line |= {"mean": float(states[:, :, 1, 0, 0].mean()), "sd": float(states[:, :, 1, 0, 0].std())}
+        line |= {
+            "mean": float(states[:, :, 1, 0, 0].mean()),
+            "sd": float(states[:, :, 1, 0, 0].std()),
+        }
         line |= {"mean_log_density": float(log_density.mean()), "jax": jax.__version__}
         show(line)
 

@@ -2,13 +2,15 @@
 
     python benchmarks/trees.py [--quick] [--parts linear flow species large]
 
-`linear`: processes of two traits on random binary trees, value, gradient and compile time, beside prunings in NumPy
-that take all nodes of one height at once. `flow`: Kunita flows of 16 landmarks, 20 steps a branch. `species`: wings of
-30 species of butterflies at 20 points, 6 steps a branch, then steps no longer than the longest of those, then half as
-long, with the spread of the log weight; they are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or
-`../shared/data`. `large`, if asked for: 425 tips of 118 landmarks, 25 steps a branch, minutes.
+`linear`: processes of two traits on random binary trees, value, gradient and compile time, beside
+prunings in NumPy that take all nodes of one height at once. `flow`: Kunita flows of 16 landmarks,
+20 steps a branch. `species`: wings of 30 species of butterflies at 20 points, 6 steps a branch,
+then steps no longer than the longest of those, then half as long, with the spread of the log
+weight; they are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or `../shared/data`.
+`large`, if asked for: 425 tips of 118 landmarks, 25 steps a branch, minutes.
 
-One JSON line each, double precision, run times the minimum of several, memory the peak of the process.
+One JSON line each, double precision, run times the minimum of several, memory the peak of the
+process.
 """
 
 import argparse
@@ -57,7 +59,9 @@ def numpy_pruning(tree: nb.Tree, data, B=None):
     def steps():
         """e^{Bt} and the covariance for every branch, by the eigenvectors of B."""
         if B is None:
-            return np.broadcast_to(np.eye(2), (len(parents), 2, 2)), lengths[:, None, None] * COVARIANCE
+            return np.broadcast_to(np.eye(2), (len(parents), 2, 2)), lengths[
+                :, None, None
+            ] * COVARIANCE
         rates, V = np.linalg.eig(B)
         W = np.linalg.inv(V)
         both = rates[:, None] + rates[None]
@@ -74,7 +78,9 @@ def numpy_pruning(tree: nb.Tree, data, B=None):
             C, E = covariance[nodes], flow[nodes]
             S = np.eye(2) + H[nodes] @ C
             G = np.linalg.solve(S, np.concatenate([H[nodes], F[nodes][..., None]], axis=2))
-            c += 0.5 * np.einsum("ni,nij,nj->", F[nodes], C, G[..., 2]) - 0.5 * np.sum(np.log(np.linalg.det(S)))
+            c += 0.5 * np.einsum("ni,nij,nj->", F[nodes], C, G[..., 2]) - 0.5 * np.sum(
+                np.log(np.linalg.det(S))
+            )
             G = E.transpose(0, 2, 1) @ G
             np.add.at(H, parents[nodes], G[..., :2] @ E)
             np.add.at(F, parents[nodes], G[..., 2])
@@ -104,7 +110,11 @@ def linear(num_tips: int, repeats: int):
     B = np.array([[-1.0, 0.1], [0.1, -0.5]])
     for name, sde, plain in (
         ("Brownian", nb.BrownianMotion(COVARIANCE), numpy_pruning(tree, data)),
-        ("Ornstein-Uhlenbeck", nb.LinearSDE(B, np.linalg.cholesky(COVARIANCE)), numpy_pruning(tree, data, B)),
+        (
+            "Ornstein-Uhlenbeck",
+            nb.LinearSDE(B, np.linalg.cholesky(COVARIANCE)),
+            numpy_pruning(tree, data, B),
+        ),
     ):
         reference = seconds(plain, repeats)
 
@@ -113,11 +123,24 @@ def linear(num_tips: int, repeats: int):
             return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data)
 
         value, value_compile = compiled(log_likelihood, sde, tree)
-        gradient, gradient_compile = compiled(jax.value_and_grad(log_likelihood, argnums=(0, 1)), sde, tree)
+        gradient, gradient_compile = compiled(
+            jax.value_and_grad(log_likelihood, argnums=(0, 1)), sde, tree
+        )
         own = seconds(lambda program=value, sde=sde: program(sde, tree), repeats)
-        line = {"process": name, "tips": num_tips, "value_ms": 1e3 * own, "numpy_ms": 1e3 * reference}
-        line |= {"ratio": own / reference, "value_compile_s": value_compile, "gradient_compile_s": gradient_compile}
-        line["gradient_ms"] = 1e3 * seconds(lambda program=gradient, sde=sde: program(sde, tree), repeats)
+        line = {
+            "process": name,
+            "tips": num_tips,
+            "value_ms": 1e3 * own,
+            "numpy_ms": 1e3 * reference,
+        }
+        line |= {
+            "ratio": own / reference,
+            "value_compile_s": value_compile,
+            "gradient_compile_s": gradient_compile,
+        }
+        line["gradient_ms"] = 1e3 * seconds(
+            lambda program=gradient, sde=sde: program(sde, tree), repeats
+        )
         line["difference"] = abs(float(value(sde, tree)) - plain())
         show(line)
 
@@ -168,13 +191,25 @@ def species(repeats: int, num_draws: int):
 
         noise = jr.normal(jr.key(0), (num_draws, *law(amplitude).noise_prior().shape()))
         value, compile_s = compiled(log_weight, amplitude, noise[0])
-        gradient, gradient_compile_s = compiled(jax.value_and_grad(log_weight, (0, 1)), amplitude, noise[0])
+        gradient, gradient_compile_s = compiled(
+            jax.value_and_grad(log_weight, (0, 1)), amplitude, noise[0]
+        )
         found = np.array([value(amplitude, one) for one in noise])
-        line = {"process": "Kunita, 30 species, 20 landmarks", "steps": steps, "rows": noise.shape[1]}
+        line = {
+            "process": "Kunita, 30 species, 20 landmarks",
+            "steps": steps,
+            "rows": noise.shape[1],
+        }
         line |= {"mean": found.mean(), "sd": found.std(), "compile_s": compile_s}
         line["value_ms"] = 1e3 * seconds(lambda run=value, z=noise[0]: run(amplitude, z), repeats)
         line["gradient_compile_s"] = gradient_compile_s
-        show(line | {"gradient_ms": 1e3 * seconds(lambda run=gradient, z=noise[0]: run(amplitude, z), repeats)})
+        show(
+            line
+            | {
+                "gradient_ms": 1e3
+                * seconds(lambda run=gradient, z=noise[0]: run(amplitude, z), repeats)
+            }
+        )
 
 
 def large(quick: bool):
@@ -186,7 +221,9 @@ def large(quick: bool):
 
     def law(kernel):
         match = nb.InexactMatch.from_point_sd(0.01, space)
-        return nb.DiffusionTree(nb.KunitaFlow(space, kernel), circle, match, tree=tree, num_steps=num_steps)
+        return nb.DiffusionTree(
+            nb.KunitaFlow(space, kernel), circle, match, tree=tree, num_steps=num_steps
+        )
 
     kernel = nb.GaussianKernel(0.1, 0.3)
     data = jax.jit(lambda key: law(kernel).sample(key))(jr.key(0))
@@ -204,7 +241,9 @@ def large(quick: bool):
 
 
 def show(line):
-    rounded = {key: x if isinstance(x, (str, int)) else float(f"{x:.4g}") for key, x in line.items()}
+    rounded = {
+        key: x if isinstance(x, (str, int)) else float(f"{x:.4g}") for key, x in line.items()
+    }
     print(json.dumps(rounded), flush=True)
 
 

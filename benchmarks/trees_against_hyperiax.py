@@ -1,15 +1,17 @@
 """Inference on trees beside hyperiax 3.0, on the two trees of its notebooks.
 
-    pip install ".[benchmarks]"
-    python benchmarks/trees_against_hyperiax.py [--quick] [--parts gaussian weight kunita] [--iterations 2000]
+    pip install ".[benchmarks]" python benchmarks/trees_against_hyperiax.py [--quick] [--parts
+    gaussian weight kunita] [--iterations 2000]
 
-`gaussian`: a binary tree of 16 leaves, Brownian motion, two variances with priors: NUTS by both, beside a grid.
-`weight`: a Kunita flow of 16 landmarks on a ternary tree of 9 leaves, 100 steps a branch: one guided log weight.
-`kunita`: on that tree amplitude and length scale with priors; by hyperiax random walks of the parameters and pCN of the
-noise, with the settings of its notebook, by this package function-space HMC. Data are the same, simulated here.
+`gaussian`: a binary tree of 16 leaves, Brownian motion, two variances with priors: NUTS by both,
+beside a grid. `weight`: a Kunita flow of 16 landmarks on a ternary tree of 9 leaves, 100 steps a
+branch: one guided log weight. `kunita`: on that tree amplitude and length scale with priors; by
+hyperiax random walks of the parameters and pCN of the noise, with the settings of its notebook, by
+this package function-space HMC. Data are the same, simulated here.
 
-One JSON line each. ESS is that of ArviZ, in bulk, the smallest where several numbers are meant; seconds of a run are
-those of all draws, warmup included; compiling is left out of `gaussian`, and is in `kunita`.
+One JSON line each. ESS is that of ArviZ, in bulk, the smallest where several numbers are meant;
+seconds of a run are those of all draws, warmup included; compiling is left out of `gaussian`, and
+is in `kunita`.
 """
 
 import argparse
@@ -63,14 +65,18 @@ def binary(depth: int) -> nb.Tree:
 
 
 def log_density_on_grid(tree, data):
-    """log σ², log τ² and the posterior's weight of each, from the dense normal law of the leaves."""
+    """log σ², log τ² and the posterior's weight of each, by the dense normal law of the leaves."""
     lineages = [set(tree._lineage(tip)) for tip in tree.tips]
     shared = np.array([[len(a & b) - 1.0 for b in lineages] for a in lineages])
     values, vectors = np.linalg.eigh(shared)
-    log_sigma, log_tau = np.meshgrid(np.linspace(-7, 5, 600), np.linspace(-12, 5, 600), indexing="ij")
+    log_sigma, log_tau = np.meshgrid(
+        np.linspace(-7, 5, 600), np.linspace(-12, 5, 600), indexing="ij"
+    )
     variance = np.exp(log_sigma)[..., None] * values + np.exp(log_tau)[..., None]
     quadratic = np.sum((vectors.T @ data[:, 0]) ** 2 / variance, axis=-1)
-    log_density = -0.5 * (quadratic + np.sum(np.log(variance), axis=-1)) - (log_sigma**2 + log_tau**2) / 8
+    log_density = (
+        -0.5 * (quadratic + np.sum(np.log(variance), axis=-1)) - (log_sigma**2 + log_tau**2) / 8
+    )
     weight = np.exp(log_density - log_density.max())
     return log_sigma, log_tau, weight / weight.sum()
 
@@ -81,12 +87,16 @@ def gaussian(arguments):
     data = np.asarray(law.sample(jr.key(202605)))
     *logs, weight = log_density_on_grid(tree, data)
     truth = [np.sum(weight * log) for log in logs]
-    spread = [np.sqrt(np.sum(weight * (log - mean) ** 2)) for log, mean in zip(logs, truth, strict=True)]
+    spread = [
+        np.sqrt(np.sum(weight * (log - mean) ** 2)) for log, mean in zip(logs, truth, strict=True)
+    ]
 
     def ours():
         log_theta = numpyro.sample("log_theta", dist.Normal(jnp.zeros(2), 2.0).to_event(1))
         sigma, tau = jnp.exp(log_theta)
-        law = nb.DiffusionTree(nb.BrownianMotion(sigma), jnp.zeros(1), nb.InexactMatch(tau), tree=tree)
+        law = nb.DiffusionTree(
+            nb.BrownianMotion(sigma), jnp.zeros(1), nb.InexactMatch(tau), tree=tree
+        )
         noise = jnp.zeros(law.noise_prior().shape())  # of which the density does not depend
         numpyro.sample("tips", law.given(noise), obs=data)
 
@@ -101,21 +111,36 @@ def gaussian(arguments):
         log_theta = numpyro.sample("log_theta", dist.Normal(jnp.zeros(2), 2.0).to_event(1))
         z = numpyro.sample("z", dist.Normal(jnp.zeros(topology.size), 1.0).to_event(1))
         sigma, tau = jnp.exp(log_theta)
-        found = bffg.init_discrete_tree(empty, jnp.asarray(data), obs_var=tau, d=1, root_val=jnp.zeros(1))
+        found = bffg.init_discrete_tree(
+            empty, jnp.asarray(data), obs_var=tau, d=1, root_val=jnp.zeros(1)
+        )
         found = guide(filter_back(found, params=sigma).set(z=z[:, None]), params=sigma)
-        numpyro.factor("bffg", found.log_norm[0] + found.log_corr.sum())  # the message at a root of 0
+        # the message at a root of 0
+        numpyro.factor("bffg", found.log_norm[0] + found.log_corr.sum())
 
     draws = 500 if arguments.quick else 4000
     for name, model in (("numpyro_bridges", ours), ("hyperiax", theirs)):
-        run = {"num_warmup": draws // 4, "num_samples": draws, "num_chains": 4, "chain_method": "vectorized"}
+        run = {
+            "num_warmup": draws // 4,
+            "num_samples": draws,
+            "num_chains": 4,
+            "chain_method": "vectorized",
+        }
         mcmc = MCMC(NUTS(model), progress_bar=False, **run)
         elapsed = ran(mcmc, jr.key(7))
         found = np.asarray(mcmc.get_samples(group_by_chain=True)["log_theta"])
         ess, rhat = summary(found)
-        line = {"part": "gaussian", "package": name, "seconds": elapsed, "ess": ess, "ess_per_s": ess / elapsed}
+        line = {
+            "part": "gaussian",
+            "package": name,
+            "seconds": elapsed,
+            "ess": ess,
+            "ess_per_s": ess / elapsed,
+        }
         line |= {"rhat": rhat}
         for i, parameter in enumerate(("log_sigma2", "log_tau2")):
-            line[f"{parameter}_off"] = (found[..., i].mean() - truth[i]) / spread[i]  # in posterior SDs
+            # in posterior SDs
+            line[f"{parameter}_off"] = (found[..., i].mean() - truth[i]) / spread[i]
             line[f"{parameter}_sd_ratio"] = found[..., i].std() / spread[i]
         show(line)
 
@@ -134,7 +159,9 @@ AMPLITUDE, LENGTH_SCALE = 0.1, 0.25
 def law_of(amplitude, length_scale, num_steps, guide=None):
     space = nb.Landmarks(POINTS, DIM, weights=1.0)
     flow = nb.KunitaFlow(space, covariance=nb.MaternKernel(amplitude, length_scale))
-    return nb.DiffusionTree(flow, CIRCLE, nb.InexactMatch(VARIANCE), tree=TERNARY, num_steps=num_steps, guide=guide)
+    return nb.DiffusionTree(
+        flow, CIRCLE, nb.InexactMatch(VARIANCE), tree=TERNARY, num_steps=num_steps, guide=guide
+    )
 
 
 class Theirs:
@@ -143,7 +170,9 @@ class Theirs:
     def __init__(self, data, num_steps: int, num_refinements: int = 3):
         self.topology = hyperiax.symmetric_topology(depth=2, degree=3)
         size = self.topology.size
-        empty = hyperiax.Tree.empty(self.topology, bffg.continuous_schema(d=SIZE, n_steps=num_steps))
+        empty = hyperiax.Tree.empty(
+            self.topology, bffg.continuous_schema(d=SIZE, n_steps=num_steps)
+        )
         self.root = jnp.asarray(CIRCLE.ravel(), jnp.result_type(float))
         path = jnp.broadcast_to(self.root, (num_steps + 1, SIZE))
         self.empty = empty.set(edge_len=jnp.ones(size)).at[self.topology.is_root].set(vals=path)
@@ -152,7 +181,9 @@ class Theirs:
         self.filter_back = bffg.continuous_bf_sweep(num_steps, None, None, self.diffusion)
         self.refine = bffg.continuous_refine_anchor()
         still = lambda t, x, p: jnp.zeros(SIZE)  # noqa: E731
-        self.guide = bffg.continuous_fg_sweep(num_steps, still, self.diffusion, None, None, self.diffusion)
+        self.guide = bffg.continuous_fg_sweep(
+            num_steps, still, self.diffusion, None, None, self.diffusion
+        )
         self.num_noises = size * num_steps * SIZE
 
     @staticmethod
@@ -204,10 +235,20 @@ def weight(arguments):
         run = jax.jit(value)
         gradient = jax.jit(jax.value_and_grad(value, argnums=(0, 1, 2)))
         found = np.array([run(one, AMPLITUDE, LENGTH_SCALE) for one in z])
-        line = {"part": "weight", "package": name, "steps": num_steps, "mean": found.mean(), "sd": found.std()}
-        line["value_ms"] = 1e3 * seconds(lambda run=run, z=z: run(z[0], AMPLITUDE, LENGTH_SCALE), 10)
+        line = {
+            "part": "weight",
+            "package": name,
+            "steps": num_steps,
+            "mean": found.mean(),
+            "sd": found.std(),
+        }
+        line["value_ms"] = 1e3 * seconds(
+            lambda run=run, z=z: run(z[0], AMPLITUDE, LENGTH_SCALE), 10
+        )
         jax.block_until_ready(gradient(z[0], AMPLITUDE, LENGTH_SCALE))
-        line["gradient_ms"] = 1e3 * seconds(lambda run=gradient, z=z: run(z[0], AMPLITUDE, LENGTH_SCALE), 5)
+        line["gradient_ms"] = 1e3 * seconds(
+            lambda run=gradient, z=z: run(z[0], AMPLITUDE, LENGTH_SCALE), 5
+        )
         show(line)
 
 
@@ -215,7 +256,9 @@ WalkState = namedtuple("WalkState", ["u", "potential_energy", "accepted", "rng_k
 
 
 class WalkAndPCN(MCMCKernel):
-    """What its notebook samples with: pCN of the noise, then a random walk of the logs of the parameters."""
+    """What its notebook samples with: pCN of the noise, then a random walk of the logs of the
+    parameters.
+    """
 
     sample_field = "u"
     scales = {"amplitude": 0.05, "length_scale": 0.04}
@@ -236,16 +279,21 @@ class WalkAndPCN(MCMCKernel):
         z = u["z"]
         proposed = jnp.sqrt(1 - self.beta**2) * z + self.beta * jr.normal(key_z, z.shape)
         there = self.potential(u | {"z": proposed})
-        log_ratio = energy - there + 0.5 * (jnp.sum(proposed**2) - jnp.sum(z**2))  # of the likelihood alone
+        # of the likelihood alone
+        log_ratio = energy - there + 0.5 * (jnp.sum(proposed**2) - jnp.sum(z**2))
         taken = jnp.log(jr.uniform(key_accept)) < log_ratio
         u["z"], energy = jnp.where(taken, proposed, z), jnp.where(taken, there, energy)
 
         keys = jr.split(key_walk, len(self.scales))
-        walked = {n: u[n] + s * jr.normal(k) for (n, s), k in zip(self.scales.items(), keys, strict=True)}
+        walked = {
+            n: u[n] + s * jr.normal(k) for (n, s), k in zip(self.scales.items(), keys, strict=True)
+        }
         there = self.potential(u | walked)
         moved = jnp.log(jr.uniform(key_end)) < energy - there
         u |= {name: jnp.where(moved, value, u[name]) for name, value in walked.items()}
-        return WalkState(u, jnp.where(moved, there, energy), jnp.stack([taken, moved]).astype(float), key)
+        return WalkState(
+            u, jnp.where(moved, there, energy), jnp.stack([taken, moved]).astype(float), key
+        )
 
 
 def parameters():
@@ -258,7 +306,11 @@ def report(name, elapsed, samples, ancestors, quantities):
     for parameter in ("amplitude", "length_scale"):
         draws = np.log(np.asarray(samples[parameter]))
         ess, rhat = summary(draws)
-        line |= {f"{parameter}_ess": ess, f"{parameter}_ess_per_s": ess / elapsed, f"{parameter}_rhat": rhat}
+        line |= {
+            f"{parameter}_ess": ess,
+            f"{parameter}_ess_per_s": ess / elapsed,
+            f"{parameter}_rhat": rhat,
+        }
         line |= {f"{parameter}_log_mean": draws.mean(), f"{parameter}_log_sd": draws.std()}
     line["ancestors_ess"], line["ancestors_rhat"] = summary(ancestors)
     show(line)
@@ -305,9 +357,14 @@ def kunita(arguments):
     walk = WalkAndPCN(found.potential_fn, found.postprocess_fn)
     thinning = 10  # its noise would fill the memory
     mcmc = MCMC(
-        walk, num_warmup=0, num_samples=iterations, num_chains=3, chain_method="parallel", thinning=thinning,
+        walk,
+        num_warmup=0,
+        num_samples=iterations,
+        num_chains=3,
+        chain_method="parallel",
+        thinning=thinning,
         progress_bar=False,
-    )  # fmt: skip
+    )
     start = time.perf_counter()
     mcmc.run(jr.key(404), init_params=starts)
     samples = jax.block_until_ready(mcmc.get_samples(group_by_chain=True))
@@ -324,9 +381,15 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="few steps and draws: that all runs")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--draws", type=int, default=150, help="of each of 4 chains of function-space HMC")
-    parser.add_argument("--iterations", type=int, default=10_000, help="of each of 3 chains of hyperiax's notebook")
-    parser.add_argument("--double", action="store_true", help="double precision; hyperiax's notebooks use single")
+    parser.add_argument(
+        "--draws", type=int, default=150, help="of each of 4 chains of function-space HMC"
+    )
+    parser.add_argument(
+        "--iterations", type=int, default=10_000, help="of each of 3 chains of hyperiax's notebook"
+    )
+    parser.add_argument(
+        "--double", action="store_true", help="double precision; hyperiax's notebooks use single"
+    )
     parser.add_argument("--progress", action="store_true")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", arguments.double)

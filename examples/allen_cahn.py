@@ -1,14 +1,15 @@
 # %% [markdown]
 # # A random field seen at a few places and times: its law, and the field itself
 #
-# A field u(s, t) on [0, 1], with no flux through the ends, goes to +1 or −1, spreads, and is driven by noise that is
-# smooth in space, the stochastic Allen–Cahn equation
+# A field u(s, t) on [0, 1], with no flux through the ends, goes to +1 or −1, spreads, and is driven
+# by noise that is smooth in space, the stochastic Allen–Cahn equation
 #
 #     du = (ν ∂²u/∂s² + r (u − u³)) dt + dW,      W with coefficients of variance σ² / (1 + n²)²
 #
-# It is a semilinear equation in the cosines, which diagonalise ∂²/∂s²: what is linear is stepped exactly, so that no
-# resolution is too fine for a step. Six places are measured at six times, with an error. How fast does the field spread
-# and react, how strong is the noise, and what was the field where nobody looked?
+# It is a semilinear equation in the cosines, which diagonalise ∂²/∂s²: what is linear is stepped
+# exactly, so that no resolution is too fine for a step. Six places are measured at six times, with
+# an error. How fast does the field spread and react, how strong is the noise, and what was the
+# field where nobody looked?
 #
 #     python examples/allen_cahn.py              # on two cores some ten minutes
 #     python examples/allen_cahn.py --quick      # two or three, most of which is compilation
@@ -31,7 +32,9 @@ from numpyro.infer import MCMC, Predictive
 
 import numpyro_bridges as nb
 
-parser = argparse.ArgumentParser(description="A stochastic Allen–Cahn field at a few places and times.")
+parser = argparse.ArgumentParser(
+    description="A stochastic Allen–Cahn field at a few places and times."
+)
 parser.add_argument("--quick", action="store_true", help="fewer modes, steps and draws, 2 chains")
 parser.add_argument("--modes", type=int, default=15, help="the highest of the cosines")
 parser.add_argument("--steps", type=int, default=10, help="between two times")
@@ -48,7 +51,8 @@ ERROR = 0.1
 
 # %% [markdown]
 # ## The model
-# A time series is a chain, a tree without branches. Where measured, a field is a row of the basis at that place.
+# A time series is a chain, a tree without branches. Where measured, a field is a row of the basis
+# at that place.
 
 # %%
 space = nb.CosineBasis(arguments.modes, 1)
@@ -65,7 +69,9 @@ def reaction(t, x, rate):
 
 
 def law_of(diffusivity, rate, noise):
-    sde = nb.SemilinearSDE(diffusivity * space.laplacian, reaction, noise * jnp.sqrt(spectrum), rate, space=space)
+    sde = nb.SemilinearSDE(
+        diffusivity * space.laplacian, reaction, noise * jnp.sqrt(spectrum), rate, space=space
+    )
     match = nb.InexactMatch(ERROR**2, operator=space.basis(places))
     return nb.DiffusionTree(sde, start, match, tree=chain, num_steps=arguments.steps)
 
@@ -124,7 +130,9 @@ def over_time(path):
     return jnp.concatenate([path[0, :1], path[:, 1:].reshape(-1, space.size)])
 
 
-fields = np.asarray(jax.jit(jax.vmap(field))({name: posterior[name][::5] for name in (*TRUTH, "field_noise")}))
+fields = np.asarray(
+    jax.jit(jax.vmap(field))({name: posterior[name][::5] for name in (*TRUTH, "field_noise")})
+)
 grid = np.concatenate([[0.0], np.asarray(truth.times)[:, 1:].reshape(-1)])
 panels = {"the field": over_time(true_field) @ space.basis(along).T}
 panels |= {"posterior mean": fields.mean(axis=0), "posterior SD": fields.std(axis=0)}
@@ -132,13 +140,25 @@ covered = np.mean(np.abs(panels["the field"] - fields.mean(axis=0)) < 2 * fields
 print(f"within 2 SD of the posterior mean: {100 * covered:.0f} % of the true field")
 
 arguments.output.mkdir(parents=True, exist_ok=True)
-written = [arguments.output / name for name in ("allen_cahn.nc", "allen_cahn_field.png", "allen_cahn_posterior.png")]
+written = [
+    arguments.output / name
+    for name in ("allen_cahn.nc", "allen_cahn_field.png", "allen_cahn_posterior.png")
+]
 results.to_netcdf(str(written[0]), engine="h5netcdf")
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.4), sharey=True, constrained_layout=True)
 for ax, (title, values) in zip(axes, panels.items(), strict=True):
-    limits = {"vmin": -1.5, "vmax": 1.5, "cmap": "RdBu_r"} if "SD" not in title else {"vmin": 0, "cmap": "viridis"}
+    limits = (
+        {"vmin": -1.5, "vmax": 1.5, "cmap": "RdBu_r"}
+        if "SD" not in title
+        else {"vmin": 0, "cmap": "viridis"}
+    )
     shown = ax.pcolormesh(grid, along, np.asarray(values).T, shading="gouraud", **limits)
-    ax.plot(*(points.ravel() for points in np.meshgrid(times, places)), "k.", markersize=4, clip_on=False)
+    ax.plot(
+        *(points.ravel() for points in np.meshgrid(times, places)),
+        "k.",
+        markersize=4,
+        clip_on=False,
+    )
     ax.set(title=title, xlabel="time")
     figure.colorbar(shown, ax=ax)
 axes[0].set_ylabel("place")

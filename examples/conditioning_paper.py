@@ -1,17 +1,19 @@
 # %% [markdown]
 # # Conditioning shape processes: the experiments of a paper
 #
-# Baker, Yang, Severinsen, Hipsley and Sommer (2024), "Conditioning non-linear and infinite-dimensional diffusion
-# processes": its experiments on shapes, with this library's bridges. The paper learns every score from nothing; here a
-# learned score corrects a guided bridge, weights make it exact, and ESS and k̂ say how good it is.
+# Baker, Yang, Severinsen, Hipsley and Sommer (2024), "Conditioning non-linear and
+# infinite-dimensional diffusion processes": its experiments on shapes, with this library's bridges.
+# The paper learns every score from nothing; here a learned score corrects a guided bridge, weights
+# make it exact, and ESS and k̂ say how good it is.
 #
-#     python examples/conditioning_paper.py                                     # mosquito wings, all figures
-#     python examples/conditioning_paper.py --figures bridge --start a.csv --end b.csv
+#     python examples/conditioning_paper.py                                     # mosquito wings,
+#     all figures python examples/conditioning_paper.py --figures bridge --start a.csv --end b.csv
 #     python examples/conditioning_paper.py --figures species --specimens all.csv --labels table.csv
 #     python examples/conditioning_paper.py --quick                             # some two minutes
 #
-# Files: tps or CSV, any number of points, the same in all files, row i being the same place on each shape. Shapes are
-# aligned, and drawn in units of the start's larger extent: a kernel of width 0.1 is a tenth of it.
+# Files: tps or CSV, any number of points, the same in all files, row i being the same place on each
+# shape. Shapes are aligned, and drawn in units of the start's larger extent: a kernel of width 0.1
+# is a tenth of it.
 
 # %%
 import argparse
@@ -21,7 +23,8 @@ import json
 import os
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads of its own slow small matrices down, many times over
+# threads of its own slow small matrices down, many times over
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import jax.numpy as jnp
@@ -38,12 +41,20 @@ FIGURES = ("circles", "outline", "brownian", "bridge", "species", "scores")
 parser = argparse.ArgumentParser()
 parser.add_argument("--quick", action="store_true", help="few points, steps, updates and paths")
 parser.add_argument("--figures", nargs="+", choices=FIGURES, default=FIGURES)
-parser.add_argument("--start", type=Path, help="a tps or CSV file; of several specimens, their mean")
+parser.add_argument(
+    "--start", type=Path, help="a tps or CSV file; of several specimens, their mean"
+)
 parser.add_argument("--end", type=Path, nargs="+", help="files; the first specimen of each")
-parser.add_argument("--specimens", type=Path, help="one file of many specimens, for the figure `species`")
-parser.add_argument("--labels", type=Path, help="a CSV table with a row for each of them, and their species")
+parser.add_argument(
+    "--specimens", type=Path, help="one file of many specimens, for the figure `species`"
+)
+parser.add_argument(
+    "--labels", type=Path, help="a CSV table with a row for each of them, and their species"
+)
 parser.add_argument("--label", default="species", help="the column of that table")
-parser.add_argument("--id", default="id", help="the column of a CSV file that tells specimens apart")
+parser.add_argument(
+    "--id", default="id", help="the column of a CSV file that tells specimens apart"
+)
 parser.add_argument("--points", type=int, default=32, help="landmarks of the bridges")
 parser.add_argument("--width", type=float, default=0.1, help="of the kernel, for the bridges")
 parser.add_argument("--updates", type=int, default=150, help="of each training")
@@ -73,7 +84,7 @@ def read(file):
 
 
 def prepared(shapes, start=None):
-    """Aligned shapes and their start, their mean if none is given, in units of the start's extent."""
+    """Aligned shapes and their start, by default their mean, in units of the start's extent."""
     shapes = shapes if start is None else np.concatenate([start[None], shapes])
     aligned, mean, *_ = nb.shapes.procrustes_align(shapes)
     start, ends = (mean, aligned) if start is None else (aligned[0], aligned[1:])
@@ -102,7 +113,10 @@ def one_of_each():
         with opened(arguments.labels, "rt", encoding="utf-8", newline="") as file:
             labels = [row[arguments.label] for row in csv.DictReader(file)]
         if len(labels) != len(shapes):
-            raise SystemExit(f"--labels must have a row for each of {len(shapes)} specimens, and has {len(labels)}.")
+            raise SystemExit(
+                f"--labels must have a row for each of {len(shapes)} specimens, and has "
+                f"{len(labels)}."
+            )
     elif arguments.start is not None and arguments.end is not None:
         start = read(arguments.start)
         start = start[0] if len(start) == 1 else nb.shapes.mean_shape(start)
@@ -113,7 +127,9 @@ def one_of_each():
         shapes, labels = wings.points, wings.labels
     mean, aligned = prepared(shapes)
     common = [label for label in dict.fromkeys(labels) if list(labels).count(label) > 4]
-    return mean, {label: aligned[list(labels).index(label)] for label in common[: 2 if quick else 5]}
+    return mean, {
+        label: aligned[list(labels).index(label)] for label in common[: 2 if quick else 5]
+    }
 
 
 def landmarks(shape, num=None):
@@ -124,8 +140,9 @@ def landmarks(shape, num=None):
 
 # %% [markdown]
 # ## Processes
-# `sd` is that of a point at time 1. On a Fourier basis the noise is a random Fourier series in the plane, with as many
-# frequencies as the kernel's width asks for; it does not depend on how the shape is discretised.
+# `sd` is that of a point at time 1. On a Fourier basis the noise is a random Fourier series in the
+# plane, with as many frequencies as the kernel's width asks for; it does not depend on how the
+# shape is discretised.
 
 
 # %%
@@ -142,27 +159,42 @@ def rms(difference):
 
 
 def learned(bridge, key, *, network=None, draw=None):
-    training = nb.scores.Training(updates, 8 if quick else 16, interval=max(updates // 5, 1), held_out=128)
+    training = nb.scores.Training(
+        updates, 8 if quick else 16, interval=max(updates // 5, 1), held_out=128
+    )
     if network is None and isinstance(bridge.sde.space, nb.Landmarks):
         network = nb.scores.PointNetwork(2, width=16, depth=1, key=key)
     settings = {"network": network, "training": training, "draw": draw, "progress": False}
     found = nb.scores.fit(
-        bridge.sde, bridge.condition, x0=bridge.x0, ts=bridge.ts, key=key, guide=bridge.guide, **settings
+        bridge.sde,
+        bridge.condition,
+        x0=bridge.x0,
+        ts=bridge.ts,
+        key=key,
+        guide=bridge.guide,
+        **settings,
     )
     return bridge.with_guide(found)
 
 
 def weighted_paths(bridge, key, num):
-    """`num` paths of the conditioned process: drawn from many guided ones in proportion to exp(log_weight)."""
+    """`num` paths of the conditioned process: drawn from many guided ones in proportion to
+    exp(log_weight).
+    """
     key_noise, key_choice = jr.split(key)
     noise = jr.normal(key_noise, (num_particles, *bridge.noise_shape))
-    paths, log_weights = jax.lax.map(bridge.path_and_log_weight, noise, batch_size=min(256, num_particles))
+    paths, log_weights = jax.lax.map(
+        bridge.path_and_log_weight, noise, batch_size=min(256, num_particles)
+    )
     weights = np.asarray(jax.nn.softmax(log_weights), dtype=float)
     points = (float(jr.uniform(key_choice)) + np.arange(num)) / num
     chosen = np.minimum(np.searchsorted(np.cumsum(weights), points), num_particles - 1)
     chosen = np.asarray(jr.permutation(key_choice, jnp.asarray(chosen)))
     different = len(np.unique(chosen))
-    print(f"  {num} paths resampled from {num_particles} by exp(log_weight); {different} different ones among them")
+    print(
+        f"  {num} paths resampled from {num_particles} by exp(log_weight); {different} different "
+        "ones among them"
+    )
     return np.asarray(paths)[chosen], different
 
 
@@ -183,7 +215,9 @@ def panels(num_rows, num_columns, size=2.3, shape=None):
     """Axes without frames, `size` inches wide, in the proportions of a shape."""
     aspect = 0.65 if shape is None else np.ptp(shape[:, 1]) / np.ptp(shape[:, 0])
     inches = (size * num_columns, (1.2 * size * aspect + 0.35) * num_rows)
-    figure, axes = plt.subplots(num_rows, num_columns, figsize=inches, squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        num_rows, num_columns, figsize=inches, squeeze=False, layout="constrained"
+    )
     for ax in axes.flat:
         ax.set_aspect("equal")
         ax.set_axis_off()
@@ -199,8 +233,9 @@ def magnifier(start, ends):
 
 # %% [markdown]
 # ## Circles, carried by kernels of several widths
-# In a row one noise: the more basis functions, the nearer the curves to their limit. Dots are as many landmarks,
-# carried by the same noise. (The real basis 1, cos, sin, ... has an odd number of functions.)
+# In a row one noise: the more basis functions, the nearer the curves to their limit. Dots are as
+# many landmarks, carried by the same noise. (The real basis 1, cos, sin, ... has an odd number of
+# functions.)
 
 
 # %%
@@ -211,12 +246,23 @@ def circles():
     for line, width in zip(axes, widths, strict=True):
         ends = {}
         for ax, m in zip(line, modes, strict=True):
-            paths = [circle_path(space, width, steps) for space in (nb.FourierBasis(m, 2), nb.Landmarks(2 * m + 1, 2))]
+            paths = [
+                circle_path(space, width, steps)
+                for space in (nb.FourierBasis(m, 2), nb.Landmarks(2 * m + 1, 2))
+            ]
             lines = nb.plot.path(paths[0], ax, num_outlines=6, trajectories=False)
             ax.plot(*paths[1][-1].T, "o", markersize=3, color="#d55e00", zorder=3)
             ends[2 * m + 1] = paths[0][-1], paths[1][-1]
         numbers.setdefault("circles", {})[str(width)] = circle_errors(ends, width)
-        line[0].text(-0.05, 0.5, f"width {width}", transform=line[0].transAxes, rotation=90, ha="right", va="center")
+        line[0].text(
+            -0.05,
+            0.5,
+            f"width {width}",
+            transform=line[0].transAxes,
+            rotation=90,
+            ha="right",
+            va="center",
+        )
     for ax, m in zip(axes[0], modes, strict=True):
         ax.set_title(f"{2 * m + 1} basis functions", fontsize=10)
     limits = np.array([ax.axis() for ax in axes.flat])
@@ -240,7 +286,11 @@ def circle_path(space, width, steps):
 
 def start_state(space, shape):
     """A shape as a state: its landmarks, or its Fourier coefficients."""
-    return landmarks(shape, space.size) if isinstance(space, nb.Landmarks) else space.project(jnp.asarray(shape))
+    return (
+        landmarks(shape, space.size)
+        if isinstance(space, nb.Landmarks)
+        else space.project(jnp.asarray(shape))
+    )
 
 
 def circle_errors(ends, width):
@@ -249,8 +299,14 @@ def circle_errors(ends, width):
     for n, (curve, points) in ends.items():
         on_curve = landmarks(finest, n)
         errors[str(n)] = {"fourier": rms(curve - finest), "landmarks": rms(points - on_curve)}
-        print(f"circles: width {width}, {n} functions: RMS distance at time 1 to the curve of {max(ends)}:", end=" ")
-        print(f"Fourier {errors[str(n)]['fourier']:.4f}, landmarks {errors[str(n)]['landmarks']:.4f}")
+        print(
+            f"circles: width {width}, {n} functions: RMS distance at time 1 to the curve of "
+            f"{max(ends)}:",
+            end=" ",
+        )
+        print(
+            f"Fourier {errors[str(n)]['fourier']:.4f}, landmarks {errors[str(n)]['landmarks']:.4f}"
+        )
     return errors
 
 
@@ -265,7 +321,9 @@ def outline():
     x0 = landmarks(start, 32 if quick else 64)
     sde = flow(nb.Landmarks(len(x0), 2), 0.1, sd=0.1)
     ts = jnp.linspace(0.0, 1.0, num_steps + 1)
-    path = np.asarray(nb.simulate(sde, x0, ts, jr.normal(keys["outline"], (num_steps, sde.noise_size(x0), 2))))
+    path = np.asarray(
+        nb.simulate(sde, x0, ts, jr.normal(keys["outline"], (num_steps, sde.noise_size(x0), 2)))
+    )
     figure, axes = panels(1, 1, size=5.5, shape=start)
     lines = nb.plot.path(path, axes[0, 0], num_outlines=4, trajectories=False)
     lines.set_alpha(0.7)
@@ -275,16 +333,19 @@ def outline():
     axes[0, 0].set_title(f"{names[0]}, unconditioned, kernel width 0.1", fontsize=10)
     figure.colorbar(lines, ax=axes, label="time", shrink=0.6)
     numbers["outline"] = {"rms_displacement": rms(path[-1] - path[0])}
-    print(f"outline: RMS displacement of {len(x0)} points at time 1: {numbers['outline']['rms_displacement']:.3f}")
+    print(
+        f"outline: RMS displacement of {len(x0)} points at time 1: "
+        f"{numbers['outline']['rms_displacement']:.3f}"
+    )
     save("outline.png")
 
 
 # %% [markdown]
 # ## Brownian motion between shapes
-# Q-Brownian motion with variances that fall with the frequency, the same process in both discretisations: N Fourier
-# coefficients, or the N points that they give. The default guide is exact here. Beside it, one that takes the noise to
-# be white, and for inexact matches a network that learns what this one lacks. ∇log h has a closed form, so the error of
-# each score is known.
+# Q-Brownian motion with variances that fall with the frequency, the same process in both
+# discretisations: N Fourier coefficients, or the N points that they give. The default guide is
+# exact here. Beside it, one that takes the noise to be white, and for inexact matches a network
+# that learns what this one lacks. ∇log h has a closed form, so the error of each score is known.
 
 
 # %%
@@ -311,11 +372,16 @@ def brownian():
             bridge = nb.GuidedBridge(sde, match.at(v), x0=x0, t1=1.0, num_steps=num_steps)
             found[kind, match_name] = brownian_row(f"{kind}, {match_name}", bridge, v)
             draw_brownian(ax, bridge, f"{kind}, {match_name}")
-    figure.suptitle("Brownian bridges: start (dark), end (orange), 20 paths at time 1/2", fontsize=10)
+    figure.suptitle(
+        "Brownian bridges: start (dark), end (orange), 20 paths at time 1/2", fontsize=10
+    )
     save("brownian.png")
     for match_name in matches:
         gap = float(found["Fourier", match_name] - found["landmarks", match_name]) - n * np.log(n)
-        print(f"brownian: {match_name}: log density in coefficients, less that in points, less N log N: {gap:.4f}")
+        print(
+            f"brownian: {match_name}: log density in coefficients, less that in points, less N log "
+            f"N: {gap:.4f}"
+        )
         numbers["brownian"][f"{match_name}: gap of the discretisations"] = gap
 
 
@@ -323,7 +389,11 @@ def brownian_row(name, bridge, v):
     """Compares the exact guide, a white one and its learned correction; the log evidence."""
     a = bridge.sde.covariance(0.0, bridge.x0)
     a = jnp.diag(a) if a.ndim == 1 else a
-    noise = 0.0 if bridge.condition.exact else bridge.condition.match.variance / bridge.sde.space.weights
+    noise = (
+        0.0
+        if bridge.condition.exact
+        else bridge.condition.match.variance / bridge.sde.space.weights
+    )
 
     def score(t, x):
         return jnp.linalg.solve(a * (bridge.ts[-1] - t) + noise * jnp.eye(len(a)), v - x)
@@ -334,7 +404,9 @@ def brownian_row(name, bridge, v):
         bridges["white guide"] = white
         network = nb.scores.MLP(bridge.x0.shape, key=keys["brownian"])
         bridges["learned on it"] = learned(white, keys["brownian"], network=network)
-    return report("brownian", name, bridges, keys["brownian"], score=score).rows["guided"]["log_evidence"]
+    return report("brownian", name, bridges, keys["brownian"], score=score).rows["guided"][
+        "log_evidence"
+    ]
 
 
 def draw_brownian(ax, bridge, title):
@@ -351,8 +423,8 @@ def draw_brownian(ax, bridge, title):
 
 # %% [markdown]
 # ## The bridge between two outlines
-# Guided, and with a learned correction. What is drawn has the conditioned law: paths are resampled from many in
-# proportion to their weights.
+# Guided, and with a learned correction. What is drawn has the conditioned law: paths are resampled
+# from many in proportion to their weights.
 
 
 # %%
@@ -361,7 +433,10 @@ def bridge():
     x0, v = landmarks(start), landmarks(end)
     space = nb.Landmarks(num_points, 2)
     spread = rms(v - x0)
-    sde, seen = flow(space, arguments.width, sd=spread), nb.InexactMatch.from_point_sd(NOISE * spread, space)
+    sde, seen = (
+        flow(space, arguments.width, sd=spread),
+        nb.InexactMatch.from_point_sd(NOISE * spread, space),
+    )
     guided = nb.GuidedBridge(sde, seen.at(v), x0=x0, t1=1.0, num_steps=num_steps)
     bridges = {"guided": guided, "learned": learned(guided, keys["bridge"])}
     comparison = report("bridge", f"{names[0]} to {names[1]}", bridges, keys["bridge"])
@@ -401,7 +476,10 @@ def species():
     x0, targets = landmarks(mean), jnp.stack([landmarks(end) for end in ends.values()])
     space = nb.Landmarks(num_points, 2)
     spread = rms(targets - x0)
-    sde, seen = flow(space, arguments.width, sd=spread), nb.InexactMatch.from_point_sd(NOISE * spread, space)
+    sde, seen = (
+        flow(space, arguments.width, sd=spread),
+        nb.InexactMatch.from_point_sd(NOISE * spread, space),
+    )
 
     def draw(key):
         return sde, seen.at(targets[jr.randint(key, (), 0, len(targets))]), x0

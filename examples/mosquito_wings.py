@@ -1,9 +1,10 @@
 # %% [markdown]
 # # How variable are wing shapes within a genus, and on what length scale?
 #
-# Each wing outline is the end of a Kunita flow that started at the genus mean: points close together move together,
-# over a length scale ℓ, by amounts set by an amplitude α. The outlines are seen with a small observation error. MCMC
-# draws from the posterior of (α, ℓ) and of the paths themselves, for all specimens of the genus.
+# Each wing outline is the end of a Kunita flow that started at the genus mean: points close
+# together move together, over a length scale ℓ, by amounts set by an amplitude α. The outlines are
+# seen with a small observation error. MCMC draws from the posterior of (α, ℓ) and of the paths
+# themselves, for all specimens of the genus.
 #
 #     python examples/mosquito_wings.py            # 4 chains, some minutes on 2 cores
 #     python examples/mosquito_wings.py --quick    # under a minute, to see that all runs
@@ -14,7 +15,8 @@ import os
 import time
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads of its own slow small matrices down, many times over
+# threads of its own slow small matrices down, many times over
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +31,9 @@ import numpyro_bridges as nb
 numpyro.set_host_device_count(2)  # two of the four chains on each core
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--quick", action="store_true", help="4 specimens, 16 points, few steps and draws")
+parser.add_argument(
+    "--quick", action="store_true", help="4 specimens, 16 points, few steps and draws"
+)
 parser.add_argument("--genus", default="CX", help="a genus of the data set; CX is Culex")
 parser.add_argument("--specimens", type=int, help="the first so many; by default all")
 parser.add_argument("--warmup", type=int, default=150)
@@ -43,8 +47,8 @@ num_warmup, num_samples = (30, 50) if quick else (arguments.warmup, arguments.sa
 
 # %% [markdown]
 # ## The data
-# Real outlines, resampled by arc length, aligned, at unit RMS radius; the observation error is small beside their
-# spread.
+# Real outlines, resampled by arc length, aligned, at unit RMS radius; the observation error is
+# small beside their spread.
 
 # %%
 wings = nb.datasets.mosquito_wings(num_points=num_points, genus=arguments.genus)
@@ -52,7 +56,11 @@ points = wings.points[: 4 if quick else arguments.specimens]
 space = nb.Landmarks(num_points=num_points, dim=2)
 seen = nb.InexactMatch.from_point_sd(0.005, space)
 spread = float(np.std(points - wings.mean))
-print(f"{len(points)} wings of {arguments.genus}, {num_points} points: spread of a coordinate {spread:.4f},", end=" ")
+print(
+    f"{len(points)} wings of {arguments.genus}, {num_points} points: spread of a coordinate "
+    f"{spread:.4f},",
+    end=" ",
+)
 print(f"observation SD 0.005, ratio {0.005 / spread:.2f}")
 
 
@@ -72,11 +80,14 @@ def model(observed=None, num_specimens=None):
 
 # %% [markdown]
 # ## Inference
-# A kernel that knows that the noise is nearly standard normal: 2 or 3 gradients a draw where NUTS needs some 30.
+# A kernel that knows that the noise is nearly standard normal: 2 or 3 gradients a draw where NUTS
+# needs some 30.
 
 # %%
 kernel = nb.infer.FunctionSpaceHMC(model)
-mcmc = MCMC(kernel, num_warmup=num_warmup, num_samples=num_samples, num_chains=4, chain_method="vectorized")
+mcmc = MCMC(
+    kernel, num_warmup=num_warmup, num_samples=num_samples, num_chains=4, chain_method="vectorized"
+)
 start = time.perf_counter()
 mcmc.run(jr.key(arguments.seed), points, extra_fields=nb.infer.fields(kernel))
 posterior = jax.block_until_ready(mcmc.get_samples())
@@ -104,11 +115,13 @@ print(f"divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
 def bridge_path(amplitude, length_scale, noise, observed):
     flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale))
     bridge = nb.GuidedBridge(flow, seen.at(observed), x0=wings.mean, t1=1.0, num_steps=num_steps)
-    pull = flow.covariance(0.0, bridge.x0) @ bridge.score(0.0, bridge.x0)  # a ∇log h̃, what is added to the drift
+    # a ∇log h̃, what is added to the drift
+    pull = flow.covariance(0.0, bridge.x0) @ bridge.score(0.0, bridge.x0)
     return bridge.path(noise), pull
 
 
-specimen = int(np.argmax(np.std(points - wings.mean, axis=(1, 2))))  # the wing farthest from the mean
+# the wing farthest from the mean
+specimen = int(np.argmax(np.std(points - wings.mean, axis=(1, 2))))
 chosen = np.linspace(0, len(posterior["amplitude"]) - 1, 40).astype(int)
 paths, pulls = jax.vmap(bridge_path, (0, 0, 0, None))(
     posterior["amplitude"][chosen],

@@ -1,19 +1,22 @@
 # %% [markdown]
-# # How fast did shape evolve along a phylogeny, on what length scale, and what did the ancestors look like?
+# # Shape along a phylogeny: how fast, on what length scale, and what were the ancestors like?
 #
-# A Kunita flow runs along the branches of a tree, from the root to the species: points close together move together,
-# over a length scale ℓ, by amounts set by an amplitude α. Specimens differ from the shape of their species by
-# independent normal errors at every point, of an SD that is a parameter too. MCMC draws from the posterior of these
-# three and of the paths along the branches, whose ends are the ancestors.
+# A Kunita flow runs along the branches of a tree, from the root to the species: points close
+# together move together, over a length scale ℓ, by amounts set by an amplitude α. Specimens differ
+# from the shape of their species by independent normal errors at every point, of an SD that is a
+# parameter too. MCMC draws from the posterior of these three and of the paths along the branches,
+# whose ends are the ancestors.
 #
-#     python examples/phylogeny.py --shapes wings.tps --tree tree.nwk                      # ID= is the species
-#     python examples/phylogeny.py --shapes wings.csv --names species --tree tree.nex
-#     python examples/phylogeny.py --shapes wings.tps --table specimens.csv --by specimen --names tip --tree tree.nwk
-#     python examples/phylogeny.py ... --quick       # under a minute, to see that all runs
-#     python examples/phylogeny.py ... --run saved   # saved as it goes; after a kill the same line goes on from there
+#     python examples/phylogeny.py --shapes wings.tps --tree tree.nwk                      # ID= is
+#     the species python examples/phylogeny.py --shapes wings.csv --names species --tree tree.nex
+#     python examples/phylogeny.py --shapes wings.tps --table specimens.csv --by specimen --names
+#     tip --tree tree.nwk python examples/phylogeny.py ... --quick       # under a minute, to see
+#     that all runs python examples/phylogeny.py ... --run saved   # saved as it goes; after a kill
+#     the same line goes on from there
 #
-# Shapes come in a tps or CSV file, row i being the same place on each; names are those of the tree, in Newick or NEXUS.
-# A species without a shape is left out of the tree, a shape without its tip is an error; points may be missing.
+# Shapes come in a tps or CSV file, row i being the same place on each; names are those of the tree,
+# in Newick or NEXUS. A species without a shape is left out of the tree, a shape without its tip is
+# an error; points may be missing.
 
 # %%
 import argparse
@@ -22,7 +25,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads of its own slow small matrices down, many times over
+# threads of its own slow small matrices down, many times over
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import arviz as az
 import jax
@@ -44,15 +48,27 @@ numpyro.set_host_device_count(2)
 def options(description, **defaults):
     """A parser with what any run may choose."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--quick", action="store_true", help="16 points, few steps and draws, 2 chains")
-    parser.add_argument("--points", type=int, default=32, help="landmarks, at equal steps of their number")
+    parser.add_argument(
+        "--quick", action="store_true", help="16 points, few steps and draws, 2 chains"
+    )
+    parser.add_argument(
+        "--points", type=int, default=32, help="landmarks, at equal steps of their number"
+    )
     parser.add_argument("--steps", type=int, default=6, help="on each branch")
-    parser.add_argument("--longest", type=float, help="instead, as many that none is longer, of a tree of height 1")
+    parser.add_argument(
+        "--longest", type=float, help="instead, as many that none is longer, of a tree of height 1"
+    )
     parser.add_argument("--warmup", type=int, default=200)
     parser.add_argument("--samples", type=int, default=400)
-    parser.add_argument("--fixed-root", action="store_true", help="the root is the mean, for certain")
-    parser.add_argument("--run", type=Path, help="a directory to save the run in as it goes, and to go on from")
-    parser.add_argument("--magnify", type=float, default=1.0, help="deviations from the start in the drawing")
+    parser.add_argument(
+        "--fixed-root", action="store_true", help="the root is the mean, for certain"
+    )
+    parser.add_argument(
+        "--run", type=Path, help="a directory to save the run in as it goes, and to go on from"
+    )
+    parser.add_argument(
+        "--magnify", type=float, default=1.0, help="deviations from the start in the drawing"
+    )
     parser.add_argument("--open", action="store_true", help="curves whose ends do not meet")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("output"))
@@ -61,9 +77,15 @@ def options(description, **defaults):
 
 
 def files(parser, required):
-    parser.add_argument("--shapes", type=Path, required=required, help="a file that `io.read` reads")
-    parser.add_argument("--table", type=Path, help="a CSV file with a row for each specimen, for columns of its own")
-    parser.add_argument("--by", help="the column of that table with the ids; without it, row is for row")
+    parser.add_argument(
+        "--shapes", type=Path, required=required, help="a file that `io.read` reads"
+    )
+    parser.add_argument(
+        "--table", type=Path, help="a CSV file with a row for each specimen, for columns of its own"
+    )
+    parser.add_argument(
+        "--by", help="the column of that table with the ids; without it, row is for row"
+    )
 
 
 def settings(arguments):
@@ -76,9 +98,10 @@ def settings(arguments):
 
 # %% [markdown]
 # ## The data
-# The tree is made one unit high: amplitudes say what happens between its root and the present. It sees a row for each
-# specimen of a species. The flow starts at its first split, around the mean that Brownian motion would have there given
-# the means of the species, by generalised least squares.
+# The tree is made one unit high: amplitudes say what happens between its root and the present. It
+# sees a row for each specimen of a species. The flow starts at its first split, around the mean
+# that Brownian motion would have there given the means of the species, by generalised least
+# squares.
 
 
 # %%
@@ -90,21 +113,29 @@ class Data(NamedTuple):
 
     @property
     def several(self):
-        """Whether a species has several specimens, so that something is known of the variation within."""
+        """Whether a species has several specimens, so that something is known of the variation
+        within.
+        """
         return len(self.rows) > len(self.means)
 
 
 def prepare(shapes, species, tree):
     """`Data` from shapes `(N, n, dim)` in register, the species of each, and a tree."""
-    groups = {name: shapes[np.array([other == name for other in species])] for name in dict.fromkeys(species)}
+    groups = {
+        name: shapes[np.array([other == name for other in species])]
+        for name in dict.fromkeys(species)
+    }
     tips = [tree.names[tip] for tip in tree.tips]
     if not set(groups) <= set(tips):
-        tree.rows({name: group[0] for name, group in groups.items()})  # says what is wrong with the names
+        # says what is wrong with the names
+        tree.rows({name: group[0] for name, group in groups.items()})
     lacking = [name for name in tips if name not in groups]
     if lacking:
         print(f"tips without shapes, left out: {', '.join(map(str, lacking))}")
     if len(groups) < 2:
-        raise ValueError(f"a tree needs shapes of at least two of its tips; got those of {', '.join(groups)}.")
+        raise ValueError(
+            f"a tree needs shapes of at least two of its tips; got those of {', '.join(groups)}."
+        )
     tree = from_first_split(tree.pruned(groups))
     tree = tree.scaled(1 / tree.height)
     means = {name: np.nanmean(group, axis=0) for name, group in groups.items()}
@@ -140,8 +171,9 @@ def mean_at_root(tree, rows):
 
 # %% [markdown]
 # ## The model
-# The root is as far from that mean as the flow would come in the time of another tree, a priori; with `--fixed-root` it
-# is there. Where no species has two specimens nothing is known of the variation within, and its SD is given by `--sd`.
+# The root is as far from that mean as the flow would come in the time of another tree, a priori;
+# with `--fixed-root` it is there. Where no species has two specimens nothing is known of the
+# variation within, and its SD is given by `--sd`.
 
 
 # %%
@@ -158,11 +190,15 @@ def law_of(data, arguments, amplitude, length_scale, within):
     if seen.all():
         match, own = nb.InexactMatch.from_point_sd(within, space), ()
     else:
-        match = jax.vmap(lambda points: nb.InexactMatch.from_point_sd(within, space, mask=points))(seen)
+        match = jax.vmap(lambda points: nb.InexactMatch.from_point_sd(within, space, mask=points))(
+            seen
+        )
         own = ("match",)
     prior = {} if arguments.fixed_root else {"root_covariance": flow.covariance(0.0, data.start)}
     steps = arguments.steps if arguments.longest is None else data.tree.num_steps(arguments.longest)
-    return nb.DiffusionTree(flow, data.start, match, tree=data.tree, num_steps=steps, per_row=own, **prior)
+    return nb.DiffusionTree(
+        flow, data.start, match, tree=data.tree, num_steps=steps, per_row=own, **prior
+    )
 
 
 def model_of(data, arguments, sd):
@@ -180,7 +216,11 @@ def model_of(data, arguments, sd):
 def infer(data, arguments, sd):
     """Posterior draws by chain, and results for ArviZ with the ancestors among the posterior."""
     kernel = nb.infer.FunctionSpaceHMC(model_of(data, arguments, sd))
-    run = {"num_warmup": arguments.warmup, "num_samples": arguments.samples, "num_chains": 2 if arguments.quick else 4}
+    run = {
+        "num_warmup": arguments.warmup,
+        "num_samples": arguments.samples,
+        "num_chains": 2 if arguments.quick else 4,
+    }
     mcmc = MCMC(kernel, chain_method="vectorized", **run)
     start, key = time.perf_counter(), jr.key(arguments.seed)
     rows, fields = np.nan_to_num(data.rows), nb.infer.fields(kernel)
@@ -189,8 +229,15 @@ def infer(data, arguments, sd):
     else:
         nb.infer.run_checkpointed(mcmc, arguments.run, key, rows, extra_fields=fields, keep_noise=1)
     samples = jax.block_until_ready(mcmc.get_samples(group_by_chain=True))
-    print(f"{time.perf_counter() - start:.0f} s for {run['num_chains']} chains of {arguments.warmup} + ", end="")
-    print(f"{arguments.samples} draws; divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
+    print(
+        f"{time.perf_counter() - start:.0f} s for {run['num_chains']} chains of {arguments.warmup} "
+        "+ ",
+        end="",
+    )
+    print(
+        f"{arguments.samples} draws; divergences: "
+        f"{int(np.sum(mcmc.get_extra_fields()['diverging']))}"
+    )
     prior = Predictive(parameters, num_samples=2000)(jr.key(1), data.several, sd)
     results = nb.to_arviz(mcmc, prior=prior)
     results["posterior"]["ancestor"] = ancestors(data, arguments, results)
@@ -198,16 +245,23 @@ def infer(data, arguments, sd):
 
 
 def ancestors(data, arguments, results):
-    """The inner nodes among all, with names: a draw of parameters and noise is a draw of the paths."""
+    """The inner nodes, with names: a draw of parameters and noise is a draw of the paths."""
     tree, inner = data.tree, inner_nodes(data.tree, arguments)
-    nodes = results["posterior_nodes"]["specimens"].sel(node=[tree.names[node] or f"node {node}" for node in inner])
-    labels = {"node": [name_of(tree, node) for node in inner], "coordinate": list("xyz"[: data.start.shape[1]])}
+    nodes = results["posterior_nodes"]["specimens"].sel(
+        node=[tree.names[node] or f"node {node}" for node in inner]
+    )
+    labels = {
+        "node": [name_of(tree, node) for node in inner],
+        "coordinate": list("xyz"[: data.start.shape[1]]),
+    }
     return nodes.assign_coords(labels)
 
 
 def inner_nodes(tree, arguments):
     """Numbers of the ancestors that are not known."""
-    return [node for node in range(int(arguments.fixed_root), tree.num_nodes) if node not in tree.tips]
+    return [
+        node for node in range(int(arguments.fixed_root), tree.num_nodes) if node not in tree.tips
+    ]
 
 
 def name_of(tree, node):
@@ -221,22 +275,30 @@ def report(results, samples, prior):
     print(az.summary(results, var_names=names).to_string())
     for name in names:
         before, after = np.std(prior[name]), np.std(samples[name])
-        print(f"{name}: prior SD {before:.4f}, posterior SD {after:.4f}, ratio {after / before:.2f}")
+        print(
+            f"{name}: prior SD {before:.4f}, posterior SD {after:.4f}, ratio {after / before:.2f}"
+        )
     table = az.summary(results, var_names=["ancestor"])
     worst, least = table["r_hat"].astype(float).max(), table["ess_bulk"].astype(float).min()
-    print(f"ancestors: {len(table)} coordinates, r_hat at most {worst:.3f}, bulk ESS at least {least:.0f}")
+    print(
+        f"ancestors: {len(table)} coordinates, r_hat at most {worst:.3f}, bulk ESS at least "
+        f"{least:.0f}"
+    )
 
 
 # %% [markdown]
 # ## What is left behind: a NetCDF file and two figures
-# Outlines of posterior draws lie around the mean of each ancestor. They hold the uncertainty in parameters and paths,
-# not that in the tree.
+# Outlines of posterior draws lie around the mean of each ancestor. They hold the uncertainty in
+# parameters and paths, not that in the tree.
 
 
 # %%
 def save(data, samples, prior, results, arguments, name):
     arguments.output.mkdir(parents=True, exist_ok=True)
-    written = [arguments.output / file for file in (f"{name}.nc", f"{name}_ladder.png", f"{name}_posterior.png")]
+    written = [
+        arguments.output / file
+        for file in (f"{name}.nc", f"{name}_ladder.png", f"{name}_posterior.png")
+    ]
     results.to_netcdf(str(written[0]), engine="h5netcdf")
 
     def drawn(shapes):
@@ -268,8 +330,15 @@ def analyse(data, arguments, name, sd=0.005):
     residuals = data.rows - np.stack([data.means[name] for name in data.tree.observed_names])
     free = np.sum(np.isfinite(data.rows)) * (1 - len(data.means) / len(data.rows))
     within = np.sqrt(np.nansum(residuals**2) / free) if data.several else sd
-    print(f"{len(data.rows)} specimens of {len(data.means)} species, {len(data.start)} points: SD of a ", end="")
-    print(f"coordinate between species {between:.4f}, within {within:.4f}{'' if data.several else ' (given)'}")
+    print(
+        f"{len(data.rows)} specimens of {len(data.means)} species, {len(data.start)} points: SD of "
+        "a ",
+        end="",
+    )
+    print(
+        f"coordinate between species {between:.4f}, within "
+        f"{within:.4f}{'' if data.several else ' (given)'}"
+    )
     samples, prior, results = infer(data, arguments, sd)
     report(results, samples, prior)
     save(data, samples, prior, results, arguments, name)
@@ -287,11 +356,17 @@ def read(arguments):
     if not arguments.aligned:
         shapes = nb.shapes.procrustes_align(shapes).shapes
     kept = not arguments.blanks
-    return shapes, species, nb.Tree.from_newick(arguments.tree, index=arguments.index, preserve_underscores=kept)
+    return (
+        shapes,
+        species,
+        nb.Tree.from_newick(arguments.tree, index=arguments.index, preserve_underscores=kept),
+    )
 
 
 def read_shapes(arguments):
-    """Shapes `(N, n, dim)` as the file has them, NaN where a point is missing, and what it says of each, by column."""
+    """Shapes `(N, n, dim)` as the file has them, NaN where a point is missing, and what it says of
+    each, by column.
+    """
     specimens = nb.io.read(arguments.shapes)
     if arguments.table is not None:
         specimens = nb.io.join(specimens, arguments.table, by=arguments.by)
@@ -299,7 +374,9 @@ def read_shapes(arguments):
     shapes = nb.io.stack(specimens).shapes
     count = shapes.shape[1]
     num_points = min(arguments.points, count)
-    chosen = np.linspace(0, count - 1 if arguments.open else count, num_points, endpoint=arguments.open)
+    chosen = np.linspace(
+        0, count - 1 if arguments.open else count, num_points, endpoint=arguments.open
+    )
     return shapes[:, np.round(chosen).astype(int)], rows
 
 
@@ -307,7 +384,10 @@ def column_of(rows, column, option):
     """What a column says of each specimen."""
     known = [name for name in rows[0] if all(row.get(name) for row in rows)] if rows else []
     if column not in known:
-        raise ValueError(f"{option} must be a column that every specimen has filled, one of {known}; got {column!r}.")
+        raise ValueError(
+            f"{option} must be a column that every specimen has filled, one of {known}; got "
+            f"{column!r}."
+        )
     return [row[column] for row in rows]
 
 
@@ -315,11 +395,22 @@ def main():
     parser = options("Evolution of shape along a phylogeny.")
     files(parser, required=True)
     parser.add_argument("--tree", type=Path, required=True, help="a Newick or NEXUS file")
-    parser.add_argument("--names", default="id", help="the column or key with the species, as in the tree")
+    parser.add_argument(
+        "--names", default="id", help="the column or key with the species, as in the tree"
+    )
     parser.add_argument("--index", type=int, help="which of several trees, from 0 on")
-    parser.add_argument("--blanks", action="store_true", help="underscores in names of the tree are blanks")
-    parser.add_argument("--aligned", action="store_true", help="shapes are in register, and are taken as they are")
-    parser.add_argument("--sd", type=float, default=0.005, help="of a coordinate, where no species has two specimens")
+    parser.add_argument(
+        "--blanks", action="store_true", help="underscores in names of the tree are blanks"
+    )
+    parser.add_argument(
+        "--aligned", action="store_true", help="shapes are in register, and are taken as they are"
+    )
+    parser.add_argument(
+        "--sd",
+        type=float,
+        default=0.005,
+        help="of a coordinate, where no species has two specimens",
+    )
     arguments = settings(parser.parse_args())
     try:
         data = prepare(*read(arguments))

@@ -1,7 +1,8 @@
 """Checks of what a user passes: the argument in backticks, the rule, the value got, the cure.
 
-A number is decided by its kind and never by what a conversion makes of it: NumPy parses text, counts days since 1970,
-takes True for 1 and None for NaN, and JAX drops imaginary parts and masks, all without a word.
+A number is decided by its kind and never by what a conversion makes of it: NumPy parses text,
+counts days since 1970, takes True for 1 and None for NaN, and JAX drops imaginary parts and masks,
+all without a word.
 """
 
 import datetime
@@ -19,7 +20,7 @@ import numpy as np
 from jax.core import Tracer
 
 _CURES = {
-    "boolean": "True and False are no numbers: where 1 and 0 are meant, `float(value)` or `.astype(float)`.",
+    "boolean": "True and False are no numbers: 1 and 0 are `float(value)` or `.astype(float)`.",
     "text": "Convert text first: `float(text)`, or `numpy.asarray(texts, float)`.",
     "time": (
         "Give times and dates as numbers, such as days since the first: "
@@ -28,7 +29,7 @@ _CURES = {
     "complex": "Give its real part, or real and imaginary parts as coordinates of their own.",
     "none": "None is not a number: was something left out?",
     "masked": "Some of its entries are masked: fill them in, or leave them out.",
-    "ragged": "Its rows must all have one length: a set of different shapes is a list of arrays, one call for each.",
+    "ragged": "Rows must have one length: different shapes are a list, and a call for each.",
     "key": "A random key is no number: draw some with it, `jax.random.normal(key, shape)`.",
     "other": "Give a number, or an array of numbers such as `numpy.asarray(value, float)`.",
 }
@@ -58,7 +59,9 @@ _short.maxstring = _short.maxother = _short.maxlong = 80
 
 
 def concrete(x: Any) -> np.ndarray | None:
-    """The value as a NumPy array, or None while a program is traced, and where other processes hold a part of it."""
+    """The value as a NumPy array, or None while a program is traced, and where other processes hold
+    a part of it.
+    """
     return np.asarray(x) if _is_here(x) else None
 
 
@@ -79,14 +82,15 @@ def words(value: Any) -> str:
 
 
 def as_float(x: Any, name: str) -> jax.Array:
-    """An array of the default float type; `ValueError` for what is no real number or array of them."""
+    """An array of the default float type; `ValueError` for what holds no real numbers."""
     return _converted(_real(x, name), jnp.result_type(float), name)
 
 
 def floating(x: Any, name: str) -> jax.Array:
-    """An array that keeps single and double precision; other numbers become the default float type."""
+    """An array that keeps single and double precision; others become the default float type."""
     x = _real(x, name)
-    known_double = not isinstance(x, jax.Array) and x.itemsize > 4  # whose type depends on JAX's settings
+    # whose type depends on JAX's settings
+    known_double = not isinstance(x, jax.Array) and x.itemsize > 4
     keeps = jnp.issubdtype(x.dtype, jnp.floating) and x.dtype.itemsize >= 4 and not known_double
     return jnp.asarray(x) if keeps else _converted(x, jnp.result_type(float), name)
 
@@ -94,8 +98,8 @@ def floating(x: Any, name: str) -> jax.Array:
 def known(x: Any, name: str) -> np.ndarray | None:
     """The value in double precision as the user gave it, or None where it is traced.
 
-    A constant is known inside a traced function too, but no more once it is a JAX array there: what a value decides is
-    decided by this, so that it does not depend on where an object is built.
+    A constant is known inside a traced function too, but no more once it is a JAX array there: what
+    a value decides is decided by this, so that it does not depend on where an object is built.
     """
     x = _real(x, name)
     return np.asarray(x, float) if _is_here(x) else None
@@ -106,14 +110,15 @@ def known_float(x: Any, name: str) -> np.ndarray:
     x = _real(x, name)
     require(
         _is_here(x),
-        f"`{name}` must be known before tracing; got {words(x)}. Call this outside `jax.jit` and `jax.vmap`, with a "
-        "value of which each process holds all.",
+        f"`{name}` must be known before tracing; got {words(x)}. Call this outside `jax.jit` and "
+        "`jax.vmap`, with a value of which each process holds all.",
     )
     return np.asarray(x, float)
 
 
 def exact_float(x: Any, name: str) -> jax.Array | np.ndarray:
-    """A NumPy array of double precision where the value is known, whatever the default; a traced one as it is.
+    """A NumPy array of double precision where the value is known, whatever the default; a traced
+    one as it is.
 
     For what must be subtracted before it is rounded, such as times.
     """
@@ -187,7 +192,8 @@ def _converted(x: jax.Array | np.ndarray, dtype: Any, name: str) -> jax.Array:
     lost = np.isinf(converted) & np.isfinite(x)
     if np.any(lost):
         raise ValueError(
-            f"`{name}` must fit into {dtype}; got {x[lost][0]!s}, which would be infinite. Choose other units, or "
+            f"`{name}` must fit into {dtype}; got {x[lost][0]!s}, which would be infinite. Choose "
+            "other units, or "
             'double precision: `jax.config.update("jax_enable_x64", True)`.'
         )
     with jax.ensure_compile_time_eval():  # what is known stays known while a program is traced
@@ -218,13 +224,19 @@ def positive_integers(values: Any, name: str, count: int, whose: str) -> tuple[i
     """Static sizes, one for each of `count` things."""
     numbers = known_float(values, name)
     good = numbers.shape == (count,)
-    good = good and bool(np.all((numbers == np.round(numbers)) & (numbers >= 1) & (numbers < 2**31)))
-    require(good, f"`{name}` must be positive integers, one for each of {count} {whose}; got {words(values)}.")
+    good = good and bool(
+        np.all((numbers == np.round(numbers)) & (numbers >= 1) & (numbers < 2**31))
+    )
+    require(
+        good,
+        f"`{name}` must be positive integers, one for each of {count} {whose}; got "
+        f"{words(values)}.",
+    )
     return tuple(int(number) for number in numbers)
 
 
 def flag(value: Any, name: str) -> bool:
-    """True or False, and nothing that is merely true or false to Python, such as the text "False"."""
+    """True or False, and nothing that merely counts as such to Python: the text "False"."""
     require(
         isinstance(value, (bool, np.bool_)),
         f"`{name}` must be True or False; got {words(value)}. It is known before tracing.",
@@ -238,7 +250,9 @@ def known_number(
     rule: str = "a finite number",
     ok: Callable[[float], bool] = math.isfinite,
 ) -> float:
-    """A finite setting that is known before tracing and, in the precision in use, meets a rule, in words too."""
+    """A finite setting that is known before tracing and, in the precision in use, meets a rule, in
+    words too.
+    """
     number = known_float(value, name)
     with np.errstate(over="ignore", under="ignore"):
         rounded = number.astype(jnp.result_type(float))
@@ -252,9 +266,10 @@ def known_number(
 def choice(value: Any, name: str, options: Iterable[str], cure: str = "") -> str:
     """One of a few names."""
     options = list(options)
+    known = ", ".join(map(repr, options))
     require(
         isinstance(value, str) and value in options,
-        f"`{name}` must be one of {', '.join(map(repr, options))}; got {words(value)}. {cure}".rstrip(),
+        f"`{name}` must be one of {known}; got {words(value)}. {cure}".rstrip(),
     )
     return value
 
@@ -269,7 +284,9 @@ def as_path(value: Any, name: str) -> Path:
 
 
 def require_key(key: Any, name: str = "key", several: bool = False) -> None:
-    """One random key, `jax.random.key(0)` or the raw `jax.random.PRNGKey(0)`, or `several` in one array."""
+    """One random key, `jax.random.key(0)` or the raw `jax.random.PRNGKey(0)`, or `several` in one
+    array.
+    """
     message = f"`{name}` must be a random key, such as `jax.random.key(0)`; got {words(key)}."
     require(isinstance(key, (jax.Array, np.ndarray)), message)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
@@ -278,13 +295,16 @@ def require_key(key: Any, name: str = "key", several: bool = False) -> None:
         require(key.dtype == raw.dtype and key.shape[-1:] == raw.shape, message)
     require(
         key.ndim - (not typed) in ((0, 1) if several else (0,)),
-        f"`{name}` must be one random key; got {words(key)}, several. Use vmap over them, or one of them, `keys[0]`.",
+        f"`{name}` must be one random key; got {words(key)}, several. Use vmap over them, or one "
+        "of them, `keys[0]`.",
     )
 
 
 def require_mapping(value: Any, name: str) -> None:
     """Something by name; `None` is nothing."""
-    good = value is None or (isinstance(value, Mapping) and all(isinstance(key, str) for key in value))
+    good = value is None or (
+        isinstance(value, Mapping) and all(isinstance(key, str) for key in value)
+    )
     require(good, f"`{name}` must be a dictionary by name, or None; got {words(value)}.")
 
 
@@ -308,6 +328,5 @@ def require_positive(x: jax.Array, name: str, cure: str = "") -> None:
     """Every entry is positive and finite, where that can be known."""
     value = concrete(x)
     if value is not None and not (np.all(value > 0) and np.all(np.isfinite(value))):
-        raise ValueError(
-            f"`{name}` must be positive and finite; got {np.array2string(value, threshold=8)}. {cure}".rstrip()
-        )
+        got = np.array2string(value, threshold=8)
+        raise ValueError(f"`{name}` must be positive and finite; got {got}. {cure}".rstrip())

@@ -1,9 +1,10 @@
 """A user's function as a closed program.
 
-JAX keeps compiled code by the function that it was made from. A function that reads an attribute, a global or a closure
-is the same function after what it reads has changed, and goes on with the old values, silently. So each function is
-traced once where it meets the shapes at which it is to be called: the arrays that it captures become leaves, traced
-ones too, and all else that it reads is frozen at that moment and is a part of what compiled code is kept by.
+JAX keeps compiled code by the function that it was made from. A function that reads an attribute, a
+global or a closure is the same function after what it reads has changed, and goes on with the old
+values, silently. So each function is traced once where it meets the shapes at which it is to be
+called: the arrays that it captures become leaves, traced ones too, and all else that it reads is
+frozen at that moment and is a part of what compiled code is kept by.
 """
 
 import pickle
@@ -40,8 +41,9 @@ class _Program:
             if _is_pickled(source) and close(*source).program is self:
                 return _program, source
         raise pickle.PicklingError(
-            "a function cannot be pickled where it has no name in a module, after what it reads has changed, and "
-            "where it captures values of a traced program. Give it what it reads as arguments, such as `args`."
+            "a function cannot be pickled where it has no name in a module, after what it reads "
+            "has changed, and where it captures values of a traced program. Give it what it reads "
+            "as arguments, such as `args`."
         )
 
 
@@ -62,7 +64,9 @@ _programs: weakref.WeakValueDictionary[Hashable, _Program] = weakref.WeakValueDi
 
 
 class Closed(eqx.Module):
-    """A function of arrays, and of pytrees of them, that reads nothing but its arguments and its own leaves."""
+    """A function of arrays, and of pytrees of them, that reads nothing but its arguments and its
+    own leaves.
+    """
 
     captured: tuple[Array, ...]
     program: _Program = eqx.field(static=True)
@@ -76,10 +80,11 @@ class Closed(eqx.Module):
         leaves, structure, _ = _inputs(args)
         types = list(map(_type, self.program.jaxpr.invars))
         require(
-            structure == self.program.structure and [x.shape for x in leaves] == [a.shape for a in types],
+            structure == self.program.structure
+            and [x.shape for x in leaves] == [a.shape for a in types],
             f"a function was traced for arrays {[a.shape for a in types]}, and is called with "
-            f"{[x.shape for x in leaves]}, or with objects of another structure. For other shapes make a "
-            "new object from the function itself.",
+            f"{[x.shape for x in leaves]}, or with objects of another structure. For other shapes "
+            "make a new object from the function itself.",
         )
         leaves = [x.astype(a.dtype) for x, a in zip(leaves, types, strict=True)]
         if any(varying_axes(x) for x in (*leaves, *self.captured)):
@@ -123,8 +128,11 @@ def close(function: Callable, *args) -> Closed:
         return function(*eqx.combine(jax.tree.unflatten(structure, leaves), static))
 
     traced = jax.make_jaxpr(call)(*leaves)
-    # a copy: a value of a traced program that has ended is refused here, not where the result is computed
-    captured = [jnp.array(c, copy=True) if isinstance(c, Tracer) else jnp.asarray(c) for c in traced.consts]
+    # a copy: a value of a traced program that has ended is refused here, not where the result is
+    # computed
+    captured = [
+        jnp.array(c, copy=True) if isinstance(c, Tracer) else jnp.asarray(c) for c in traced.consts
+    ]
     key: Hashable = (structure, _key(traced.jaxpr))
     if rules := _rules(traced):
         key = key, _derivative(traced.jaxpr, [*captured, *leaves], "custom_vjp_call" in rules)
@@ -149,12 +157,15 @@ def _inputs(args) -> tuple[list, Any, Any]:
     """The arrays of the arguments, their structure, and what else the arguments hold."""
     numbers = (bool, int, float, np.ndarray, np.generic)
     args = tuple(jnp.asarray(a) if isinstance(a, numbers) else a for a in args)
-    arrays, static = eqx.partition(args, lambda a: eqx.is_array(a) or isinstance(a, jax.ShapeDtypeStruct))
+    arrays, static = eqx.partition(
+        args, lambda a: eqx.is_array(a) or isinstance(a, jax.ShapeDtypeStruct)
+    )
     leaves, structure = jax.tree.flatten(arrays)
     return leaves, structure, static
 
 
-# What tells programs apart: primitives, their parameters and the exact constants, without names and sources.
+# What tells programs apart: primitives, their parameters and the exact constants, without names and
+# sources.
 
 _RULES = {"custom_jvp_call", "custom_vjp_call"}
 """Primitives with a user's rule of differentiation, a function that is new at each trace."""
@@ -171,14 +182,19 @@ def _key(jaxpr: Jaxpr) -> Hashable:
 
     inputs = declared(jaxpr.constvars), declared(jaxpr.invars)
     lines = tuple(
-        (eqn.primitive, tuple(map(name, eqn.invars)), _parameters(eqn), declared(eqn.outvars)) for eqn in jaxpr.eqns
+        (eqn.primitive, tuple(map(name, eqn.invars)), _parameters(eqn), declared(eqn.outvars))
+        for eqn in jaxpr.eqns
     )
     return inputs, lines, tuple(map(name, jaxpr.outvars))
 
 
 def _parameters(eqn) -> Hashable:
     if eqn.primitive.name in _RULES:
-        return tuple(_value(value) for value in eqn.params.values() if isinstance(value, (ClosedJaxpr, Jaxpr)))
+        return tuple(
+            _value(value)
+            for value in eqn.params.values()
+            if isinstance(value, (ClosedJaxpr, Jaxpr))
+        )
     return tuple((name, _value(value)) for name, value in sorted(eqn.params.items()))
 
 
@@ -194,7 +210,8 @@ def _value(value: Any) -> Hashable:
             data = jax.random.key_data(data)
         data = np.asarray(data)
         return value.dtype, data.shape, getattr(value, "weak_type", None), data.tobytes()
-    if isinstance(value, (bool, int, float, complex)):  # 1, 1.0 and True are equal, 0.0 and -0.0 too
+    # 1, 1.0 and True are equal, 0.0 and -0.0 too
+    if isinstance(value, (bool, int, float, complex)):
         return type(value), repr(value)
     if type(value) in (tuple, list):
         return tuple(map(_value, value))
@@ -225,23 +242,32 @@ def _hashable(value: Any) -> Hashable:
 
 
 def _rules(value: Any) -> set[str]:
-    """The rules that are met in a jaxpr, and in the jaxprs among the parameters of its equations."""
+    """The rules that are met in a jaxpr, and in those among the parameters of its equations."""
     if isinstance(value, (ClosedJaxpr, Jaxpr)):  # one class in later versions of JAX
-        found = [_rules(list(eqn.params.values())) | ({eqn.primitive.name} & _RULES) for eqn in value.eqns]
+        found = [
+            _rules(list(eqn.params.values())) | ({eqn.primitive.name} & _RULES)
+            for eqn in value.eqns
+        ]
     else:
         found = map(_rules, value) if type(value) in (tuple, list) else []
     return set().union(*found)
 
 
 def _derivative(jaxpr: Jaxpr, inputs: list, reverse: bool) -> Hashable:
-    """What rules of differentiation say of the derivative; nothing is like it where it cannot be traced."""
+    """What rules of differentiation say of the derivative; nothing is like it where it cannot be
+    traced.
+    """
     inexact = [i for i, x in enumerate(inputs) if jnp.issubdtype(x.dtype, jnp.inexact)]
     num_captured = len(jaxpr.constvars)
 
     def derivative(*inputs):
         def call(*moved):
-            values = list((dict(enumerate(inputs)) | dict(zip(inexact, moved, strict=True))).values())
-            return jaxpr_as_fun(ClosedJaxpr(jaxpr, values[:num_captured]))(*values[num_captured:])[0]
+            values = list(
+                (dict(enumerate(inputs)) | dict(zip(inexact, moved, strict=True))).values()
+            )
+            return jaxpr_as_fun(ClosedJaxpr(jaxpr, values[:num_captured]))(*values[num_captured:])[
+                0
+            ]
 
         moved = tuple(inputs[i] for i in inexact)
         if not reverse:

@@ -1,4 +1,6 @@
-"""Several bridges on one estimand: the same evidence, by different guides, with what each of them costs."""
+"""Several bridges on one estimand: the same evidence, by different guides, with what each of them
+costs.
+"""
 
 import itertools
 import math
@@ -44,13 +46,13 @@ class Comparison:
 
     `rows[name]` holds, as plain numbers,
 
-    - `log_evidence` and its `standard_error`, in nats; `rounding`, the part of an estimate that rounding may account
-      for, in nats.
+    - `log_evidence` and its `standard_error`, in nats; `rounding`, the part of an estimate that
+      rounding may account for, in nats.
     - `ess`, the effective number of particles, and `ess_fraction`, of all particles.
-    - `pareto_k`, −inf where the weights are equal to rounding; `trusted`, whether the estimate and its standard error
-      can be taken at their word, see `EvidenceEstimate`; `doubt`, why not.
-    - `seconds`, the run without compilation, and `training_seconds`; `seconds_per_effective_sample` of the run and
-      `seconds_per_effective_sample_with_training` of both.
+    - `pareto_k`, −inf where the weights are equal to rounding; `trusted`, whether the estimate and
+      its standard error can be taken at their word, see `EvidenceEstimate`; `doubt`, why not.
+    - `seconds`, the run without compilation, and `training_seconds`; `seconds_per_effective_sample`
+      of the run and `seconds_per_effective_sample_with_training` of both.
     - `score_error`, NaN where no score was given.
 
     What cannot be computed is NaN, and the estimate then not to be trusted.
@@ -63,18 +65,22 @@ class Comparison:
     def of(cls, estimates: Mapping[str, EvidenceEstimate]) -> "Comparison":
         """Of estimates by name, of one evidence and with independent errors. Times are NaN."""
         good = isinstance(estimates, Mapping) and len(estimates) > 0
-        require(good, f"`estimates` must be a dictionary of estimates by name; got {words(estimates)}.")
+        require(
+            good, f"`estimates` must be a dictionary of estimates by name; got {words(estimates)}."
+        )
         for name, estimate in estimates.items():
-            require_instance(estimate, EvidenceEstimate, f"estimates[{name!r}]", "an `EvidenceEstimate`")
+            require_instance(
+                estimate, EvidenceEstimate, f"estimates[{name!r}]", "an `EvidenceEstimate`"
+            )
         rows = {name: _row(estimate, math.nan, 0.0) for name, estimate in estimates.items()}
         return cls(min(len(estimate.log_weights) for estimate in estimates.values()), rows)
 
     def agree(self, first: str, second: str) -> bool | None:
         """Whether two log evidences lie within 3 joint standard errors, and rounding.
 
-        None where that cannot be known: where one of them is not to be trusted, and where the draws are too few,
-        an ESS below 100 or 3 joint standard errors of more than a nat. Weights that are equal to rounding are
-        enough of them, however few.
+        None where that cannot be known: where one of them is not to be trusted, and where the draws
+        are too few, an ESS below 100 or 3 joint standard errors of more than a nat. Weights that
+        are equal to rounding are enough of them, however few.
         """
         choice(first, "first", self.rows)
         choice(second, "second", self.rows)
@@ -85,7 +91,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """A sentence for every pair, on whether they agree, and on what is not to be trusted in it."""
+        """A sentence for every pair: whether they agree, and what is not to be trusted in it."""
         pairs = list(itertools.combinations(self.rows, 2))
         if not pairs:
             (name,) = self.rows
@@ -97,32 +103,48 @@ class Comparison:
         try:
             import pandas
         except ImportError as error:
-            raise ImportError("`to_pandas` needs pandas: pip install pandas. `rows` holds the same.") from error
+            raise ImportError(
+                "`to_pandas` needs pandas: pip install pandas. `rows` holds the same."
+            ) from error
         return pandas.DataFrame.from_dict(self.rows, orient="index")
 
     def plot(self, path: Any) -> Any:
-        """Log evidences ± 2 standard errors, ESS in percent and seconds per effective sample, written to a file.
+        """Log evidences ± 2 standard errors, ESS in percent and seconds per effective sample,
+        written to a file.
 
         **Arguments:** `path`: where to; matplotlib knows the format by its ending.
 
-        **Returns:** the `Figure`, closed. Grey is not to be trusted. **Errors:** `ImportError` without matplotlib.
+        **Returns:** the `Figure`, closed. Grey is not to be trusted. **Errors:** `ImportError`
+        without matplotlib.
         """
         return draw_comparison(self.rows, path)
 
     def __str__(self) -> str:
-        header = ["", "log evidence", "SE", "ESS", "ESS, %", "k̂", "s / ESS", "with training", "score error"]
+        header = [
+            "",
+            "log evidence",
+            "SE",
+            "ESS",
+            "ESS, %",
+            "k̂",
+            "s / ESS",
+            "with training",
+            "score error",
+        ]
         table = [header, *([name, *_cells(row)] for name, row in self.rows.items())]
         if all(math.isnan(row["score_error"]) for row in self.rows.values()):
             table = [line[:-1] for line in table]
         few = self.num_particles < 2
         threshold = math.nan if few else weights.pareto_k_threshold(self.num_particles)
         rule = "k̂ needs more" if few else f"k̂ must be below {threshold:.2f}"
-        return "\n".join([*_aligned(table), f"Particles of each: {self.num_particles}; {rule}.", self.verdict])
+        return "\n".join(
+            [*_aligned(table), f"Particles of each: {self.num_particles}; {rule}.", self.verdict]
+        )
 
     __repr__ = __str__
 
     def _gap(self, first: str, second: str) -> tuple[float, float, float]:
-        """The distance of two log evidences, its standard error, and what rounding may account for."""
+        """The distance of two log evidences, its standard error, and what rounding explains."""
         a, b = self.rows[first], self.rows[second]
         joint = math.hypot(a["standard_error"], b["standard_error"])
         return abs(a["log_evidence"] - b["log_evidence"]), joint, a["rounding"] + b["rounding"]
@@ -133,12 +155,21 @@ class Comparison:
         if not all(self.rows[name]["trusted"] for name in names):
             return "cannot be compared"
         _, joint, _ = self._gap(first, second)
-        few = [n for n in names if self.rows[n]["ess"] < _LEAST_ESS and self.rows[n]["standard_error"] > 0]
+        few = [
+            n
+            for n in names
+            if self.rows[n]["ess"] < _LEAST_ESS and self.rows[n]["standard_error"] > 0
+        ]
         if few:
             each = ", ".join(f"{self.rows[name]['ess']:.0f} of {name}" for name in few)
-            return f"have too few draws to compare: an ESS of {each}, and {_LEAST_ESS:.0f} are needed"
+            return (
+                f"have too few draws to compare: an ESS of {each}, and {_LEAST_ESS:.0f} are needed"
+            )
         if _JOINT_ERRORS * joint > _RESOLUTION:
-            return f"have too few draws to compare: {_JOINT_ERRORS:.0f} joint standard errors are {3 * joint:.2g} nats"
+            return (
+                f"have too few draws to compare: {_JOINT_ERRORS:.0f} joint standard errors are "
+                f"{3 * joint:.2g} nats"
+            )
         return ""
 
     def _sentence(self, first: str, second: str) -> str:
@@ -153,7 +184,9 @@ class Comparison:
         return f"{first} and {second} {found}.{self._distrust(first, second)}"
 
     def _distrust(self, *names: str) -> str:
-        doubts = [f"{name} ({self.rows[name]['doubt']})" for name in names if self.rows[name]["doubt"]]
+        doubts = [
+            f"{name} ({self.rows[name]['doubt']})" for name in names if self.rows[name]["doubt"]
+        ]
         return f" Not to be trusted: {', '.join(doubts)}." if doubts else ""
 
 
@@ -171,23 +204,29 @@ def compare(
 
     **Arguments:**
 
-    - `bridges`: by name; they differ in nothing but their guides, `{"a": bridge, "b": bridge.with_guide(guide)}`.
+    - `bridges`: by name; they differ in nothing but their guides, `{"a": bridge, "b":
+      bridge.with_guide(guide)}`.
     - `key`: split, so that the estimates' errors are independent.
-    - `num_particles`: number S of paths of each bridge. Of a single one there is no standard error, and no trust.
+    - `num_particles`: number S of paths of each bridge. Of a single one there is no standard error,
+      and no trust.
     - `batch_size`: how many a device runs at once; memory is bounded by it. At most 256 by default.
     - `training_seconds`: by name, seconds spent on training a guide. By default the last entry of
       `guide.history["seconds"]` where the guide has a history, and 0 where it has none.
-    - `score`: (t, x) ↦ ∇ log h(t, x), shaped like x, where it is known. The `score_error` of a guide's score s is then
+    - `score`: (t, x) ↦ ∇ log h(t, x), shaped like x, where it is known. The `score_error` of a
+      guide's score s is then
 
           E ∫ |s − ∇ log h|²_a dt / E ∫ |∇ log h|²_a dt,    |u|²_a = uᵀ a(t, x) u,
 
-      over 64 of the weighted paths (self-normalised) and the steps of the grid, t and x being those at a step's start.
+      over 64 of the weighted paths (self-normalised) and the steps of the grid, t and x being those
+      at a step's start.
     - `mesh`: the devices that share the paths of each bridge, as for `spread`.
 
-    **Returns:** a `Comparison`. Run times are measured after compilation, one bridge after the other.
+    **Returns:** a `Comparison`. Run times are measured after compilation, one bridge after the
+    other.
 
-    **Errors:** `ValueError` where the bridges differ in their SDE, condition, start, grid or solver (the continuous
-    weight of a diffrax solver has another expectation): there is then no one number to agree on.
+    **Errors:** `ValueError` where the bridges differ in their SDE, condition, start, grid or solver
+    (the continuous weight of a diffrax solver has another expectation): there is then no one number
+    to agree on.
     """
     _check_bridges(bridges)
     require_key(key)
@@ -196,11 +235,20 @@ def compare(
     require(good, f"`score` must be a function (t, x) of a time and a state; got {words(score)}.")
     training_seconds = {} if training_seconds is None else training_seconds
     unknown = sorted(set(training_seconds) - set(bridges))
-    require(not unknown, f"`training_seconds` must be of the bridges {sorted(bridges)}; got {unknown} too.")
+    require(
+        not unknown,
+        f"`training_seconds` must be of the bridges {sorted(bridges)}; got {unknown} too.",
+    )
     num_particles = positive_integer(num_particles, "num_particles")
-    batch_size = min(256, num_particles) if batch_size is None else positive_integer(batch_size, "batch_size")
+    batch_size = (
+        min(256, num_particles)
+        if batch_size is None
+        else positive_integer(batch_size, "batch_size")
+    )
     rows = {}
-    for (name, bridge), key_bridge in zip(bridges.items(), jr.split(key, len(bridges)), strict=True):
+    for (name, bridge), key_bridge in zip(
+        bridges.items(), jr.split(key, len(bridges)), strict=True
+    ):
         estimate, seconds = timed_estimate(bridge, key_bridge, num_particles, batch_size, mesh)
         trained = training_seconds.get(name, _trained_seconds(bridge))
         trained = known_number(trained, f"training_seconds[{name!r}]")
@@ -214,7 +262,8 @@ def compare(
 def _check_bridges(bridges) -> None:
     require(
         isinstance(bridges, Mapping) and len(bridges) > 0,
-        f'`bridges` must be a dictionary of bridges by name, such as {{"guided": bridge}}; got {bridges!r}.',
+        '`bridges` must be a dictionary of bridges by name, such as {"guided": bridge}; '
+        f"got {bridges!r}.",
     )
     for name, bridge in bridges.items():
         require_instance(bridge, GuidedBridge, f"bridges[{name!r}]", "a `GuidedBridge`")
@@ -262,12 +311,16 @@ def _row(estimate: EvidenceEstimate, seconds: float, trained: float) -> dict[str
         "training_seconds": trained,
         "score_error": math.nan,
         "seconds_per_effective_sample": seconds / ess if ess else math.inf,
-        "seconds_per_effective_sample_with_training": (seconds + trained) / ess if ess else math.inf,
+        "seconds_per_effective_sample_with_training": (seconds + trained) / ess
+        if ess
+        else math.inf,
     }
 
 
 def _checked_score_error(bridge: GuidedBridge, score, keys) -> float:
-    require(callable(score), f"`score` must be a function (t, x) of a time and a state; got {score!r}.")
+    require(
+        callable(score), f"`score` must be a function (t, x) of a time and a state; got {score!r}."
+    )
     score = close(score, bridge.ts[0], bridge.x0)
     require(
         score.shape == bridge.x0.shape,
@@ -309,10 +362,15 @@ def _cells(row) -> list[str]:
 
 def _aligned(table: list[list[str]]) -> list[str]:
     """Lines of a table, the first column to the left and the others to the right."""
-    hats = [[cell.count("\u0302") for cell in line] for line in table]  # a combining hat takes no room
+    # a combining hat takes no room
+    hats = [[cell.count("\u0302") for cell in line] for line in table]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = []
     for line, extra in zip(table, hats, strict=True):
         sized = list(zip(line, np.add(widths, extra), strict=True))
-        lines.append("  ".join([sized[0][0].ljust(sized[0][1]), *(cell.rjust(width) for cell, width in sized[1:])]))
+        lines.append(
+            "  ".join(
+                [sized[0][0].ljust(sized[0][1]), *(cell.rjust(width) for cell, width in sized[1:])]
+            )
+        )
     return lines

@@ -1,6 +1,7 @@
 """Batches over devices: particles, specimens, chains and edges are spread, never the state of one.
 
-Every device runs a program of its own on its share, and waits for no other: its loops end when they end.
+Every device runs a program of its own on its share, and waits for no other: its loops end when they
+end.
 """
 
 from collections.abc import Callable
@@ -26,18 +27,21 @@ def spread(
 
         weights = jax.jit(nb.spread(bridge.log_weight, mesh))(noises)
 
-    It is `jax.vmap(fn)`, which is what each device does with its share; a share of one is not batched at all. Of keys
-    there is one for each item, so that what is drawn does not depend on the number of devices. Inside `jax.jit`.
+    It is `jax.vmap(fn)`, which is what each device does with its share; a share of one is not
+    batched at all. Of keys there is one for each item, so that what is drawn does not depend on the
+    number of devices. Inside `jax.jit`.
 
     **Arguments:**
 
     - `fn`: of arrays, or pytrees of them. What it reads besides its arguments is on every device.
-    - `mesh`: a `jax.sharding.Mesh` of one axis, of this process or of several. By default, as many of the devices of
-      this process as give equal shares; one, where `jax_default_device` says which.
+    - `mesh`: a `jax.sharding.Mesh` of one axis, of this process or of several. By default, as many
+      of the devices of this process as give equal shares; one, where `jax_default_device` says
+      which.
     - `axis`: of a mesh of several axes, the one to spread along. The others repeat the work.
     - `batch_size`: how many items a device runs at once; all of its share by default.
 
-    **Returns:** a function of arguments with the batch in front, of which the results stay where they are computed.
+    **Returns:** a function of arguments with the batch in front, of which the results stay where
+    they are computed.
 
     **Errors:** `ValueError` where the devices do not divide the batch.
     """
@@ -63,7 +67,8 @@ def spread(
         if devices is None:
             return of_share(*args)
         along = PartitionSpec(name)
-        # unchecked: the first carry of a loop is often a constant, which does not vary over devices as the next does
+        # unchecked: the first carry of a loop is often a constant, which does not vary over devices
+        # as the next does
         mapped = jax.shard_map(
             of_share, mesh=devices, in_specs=along, out_specs=along, check_vma=False
         )
@@ -75,7 +80,9 @@ def spread(
 def mesh_for(
     size: int, name: str, mesh: Mesh | None = None, axis: str | None = None
 ) -> Mesh | None:
-    """The mesh on which a batch of `size` items, which an error calls `name`, runs; None where there is one device."""
+    """The mesh on which a batch of `size` items, which an error calls `name`, runs; None where
+    there is one device.
+    """
     require_mesh(mesh, axis)
     if mesh is None:
         chosen = getattr(jax.config, "jax_default_device", None)
@@ -85,10 +92,11 @@ def mesh_for(
     number = mesh.shape[axis or mesh.axis_names[0]]
     require(
         size % number == 0,
-        f"{name} must be a multiple of the {number} devices of `mesh`; got {size}. Make it one, or give a smaller "
-        "mesh.",
+        f"{name} must be a multiple of the {number} devices of `mesh`; got {size}. Make it one, "
+        "or give a smaller mesh.",
     )
-    # whatever the types of its axes: what comes out of a mesh of explicit ones asks for a sharding at each step
+    # whatever the types of its axes: what comes out of a mesh of explicit ones asks for a sharding
+    # at each step
     return Mesh(mesh.devices, mesh.axis_names)
 
 
@@ -107,7 +115,7 @@ def gather(tree: Any) -> Any:
 
 
 def is_writer(mesh: Mesh | None) -> bool:
-    """Whether this process writes the files of a run on a mesh, the first where there are several."""
+    """Whether this process, the first of several, writes the files of a run on a mesh."""
     return mesh is None or not mesh.is_multi_process or jax.process_index() == 0
 
 

@@ -7,7 +7,9 @@ from typing import Any
 
 
 def write_whole(file: Path, write: Callable[[Any], None]) -> None:
-    """`write(f)` fills a binary file, which then takes the place of `file`, also on a disk that loses its power."""
+    """`write(f)` fills a binary file, which then takes the place of `file`, also on a disk that
+    loses its power.
+    """
     part = file.with_suffix(".tmp")
     with open(part, "wb") as f:
         write(f)

@@ -1,8 +1,8 @@
 """Linear maps that act on the first axis of a state, stored by their shape.
 
-`()` is a multiple of the identity, `(n,)` a diagonal, `(m, n)` a matrix. A state is `(n,)` or `(n, dim)`; the same
-map acts on every column, so no Kronecker product is ever formed. The rank is known when a program is traced: a
-scalar or diagonal problem compiles to elementwise work.
+`()` is a multiple of the identity, `(n,)` a diagonal, `(m, n)` a matrix. A state is `(n,)` or `(n,
+dim)`; the same map acts on every column, so no Kronecker product is ever formed. The rank is known
+when a program is traced: a scalar or diagonal problem compiles to elementwise work.
 """
 
 import functools
@@ -17,7 +17,9 @@ from ._types import State, Structured
 
 
 def full_precision(f):
-    """Products in `f` keep float32, where a GPU's default is a 10-bit mantissa (TF32): weights need every digit."""
+    """Products in `f` keep float32, where a GPU's default is a 10-bit mantissa (TF32): weights need
+    every digit.
+    """
 
     @functools.wraps(f)
     def wrapped(*args, **kwargs):
@@ -69,7 +71,9 @@ def apply(A: Structured, x: State) -> State:
 
 
 def product(A: Array, B: Array) -> Array:
-    """A B of matrices; without a `dot` where A is small, so that a batch of products is one loop over all entries."""
+    """A B of matrices; without a `dot` where A is small, so that a batch of products is one loop
+    over all entries.
+    """
     return jnp.sum(A[:, :, None] * B[None], axis=1) if A.shape[0] <= 4 else A @ B
 
 
@@ -117,14 +121,18 @@ def promote(A: Structured, ndim: int, n: int) -> Structured:
 
 
 def safe_sqrt(x: ArrayLike) -> Array:
-    """√x whose derivative at exactly 0 is 0, where that of √x is infinite: of |y| = √y² the mean of both sides."""
+    """√x whose derivative at exactly 0 is 0, where that of √x is infinite: of |y| = √y² the mean of
+    both sides.
+    """
     zero = x == 0
     # the inner `where` keeps the infinite slope, the outer one the value 1, out of the result
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, x)))
 
 
 def cholesky(S: Structured) -> Structured:
-    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite, but for zeros of a diagonal one."""
+    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite, but for zeros of a
+    diagonal one.
+    """
     return safe_sqrt(S) if S.ndim < 2 else lax.linalg.cholesky(S, symmetrize_input=False)
 
 
@@ -137,19 +145,23 @@ def semidefinite_cholesky(S: Structured) -> Structured:
 
 
 def without_variance(S: Structured) -> Array:
-    """Where the diagonal of a covariance, or of its factor, is 0: `()` for a multiple of the identity, else `(m,)`."""
+    """Where the diagonal of a covariance, or of its factor, is 0: `()` for a multiple of the
+    identity, else `(m,)`.
+    """
     return (jnp.diagonal(S) if S.ndim == 2 else S) == 0
 
 
 def filled(S: Structured, empty: Array) -> Structured:
-    """S with variance 1 for the coordinates that have none, which no other coordinate then feels."""
+    """S with variance 1 for coordinates that have none, which no other coordinate then feels."""
     if S.ndim < 2:
         return jnp.where(empty, 1.0, S)
     return jnp.where(jnp.eye(S.shape[0], dtype=bool) & empty[:, None], 1.0, S)
 
 
 def symmetric(S: Structured) -> Structured:
-    """½ (S + Sᵀ): the derivative of a factorisation holds for symmetric matrices only, and a parameter is any."""
+    """½ (S + Sᵀ): the derivative of a factorisation holds for symmetric matrices only, and a
+    parameter is any.
+    """
     return 0.5 * (S + S.T) if S.ndim == 2 else S
 
 
@@ -157,7 +169,9 @@ def solve_lower(C: Structured, x: State, transposed: bool = False) -> State:
     """C⁻¹ x, or C⁻ᵀ x, for a lower triangular C."""
     if C.ndim < 2:
         return x / (C if C.ndim == 0 else rows(C, x))
-    out = lax.linalg.triangular_solve(C, as_columns(x), left_side=True, lower=True, transpose_a=transposed)
+    out = lax.linalg.triangular_solve(
+        C, as_columns(x), left_side=True, lower=True, transpose_a=transposed
+    )
     return out.reshape(x.shape)
 
 

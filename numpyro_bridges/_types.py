@@ -1,4 +1,6 @@
-"""Type aliases. A state is one shape, `(n, dim)`, or a plain vector `(n,)`; code is for one state, callers vmap."""
+"""Type aliases. A state is one shape, `(n, dim)`, or a plain vector `(n,)`; code is for one state,
+callers vmap.
+"""
 
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -11,7 +13,9 @@ Noise: TypeAlias = Float[Array, "k *dim"]
 """The standard normal noise of one step, one row per driving noise."""
 
 Structured: TypeAlias = Float[Array, "..."]
-"""A linear map on the first axis of a state: `()` a multiple of the identity, `(n,)` a diagonal, `(m, n)` a matrix."""
+"""A linear map on the first axis of a state: `()` a multiple of the identity, `(n,)` a diagonal,
+`(m, n)` a matrix.
+"""
 
 if TYPE_CHECKING:
     RealScalar: TypeAlias = float | int | Array

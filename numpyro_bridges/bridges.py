@@ -1,4 +1,6 @@
-"""Guided bridges: an SDE conditioned on what is seen at a later time, as a function of standard normal noise."""
+"""Guided bridges: an SDE conditioned on what is seen at a later time, as a function of standard
+normal noise.
+"""
 
 import functools
 from collections.abc import Callable
@@ -36,7 +38,9 @@ Method = TypeVar("Method", bound=Callable)
 
 
 class _PureMethod:
-    """Binds to a partial function, which `jax.jit` takes as it is: equinox's bound methods hash their arrays."""
+    """Binds to a partial function, which `jax.jit` takes as it is: equinox's bound methods hash
+    their arrays.
+    """
 
     def __init__(self, method):
         self.method, self.__doc__ = method, method.__doc__
@@ -62,14 +66,15 @@ class Problem(NamedTuple):
 
 
 class GuidedBridge(eqx.Module):
-    """The process X on [t0, t1] from x0, conditioned on its end state, driven by standard normal noise.
+    """The process X on [t0, t1] from x0, conditioned on its end state, driven by standard normal
+    noise.
 
     `path(noise)` and `log_weight(noise)` are pure functions; with z ~ N(0, I),
 
         E[exp(log_weight(z))] = p(condition | x0)
 
-    exactly for the time-discretised model (any guide, any number of steps), and the paths weighted by exp(log_weight)
-    have the law of the conditioned process.
+    exactly for the time-discretised model (any guide, any number of steps), and the paths weighted
+    by exp(log_weight) have the law of the conditioned process.
 
     **Arguments:**
 
@@ -77,14 +82,16 @@ class GuidedBridge(eqx.Module):
     - `condition`: `match.at(v)` or a `CylinderSet`.
     - `x0`: `(n, dim)` or `(n,)`.
     - `t1`, `t0`: the interval, in the time units of the SDE; t0 is 0 unless given.
-    - `num_steps`, or `ts`: the number of steps of the default grid, or an increasing grid `(K + 1,)` from t0 to t1. The
-      default is uniform, and graded towards t1, t = s(2 − s/T), where the end state is pinned. A grid whose steps
-      vanish in the precision used is refused.
-    - `guide`: by default `FrozenGuide()` where a is constant, `GeodesicGuide()` for a Kunita flow, `RecedingGuide()`
-      where a depends on the state otherwise, both with `rounds=2` for a `SemilinearSDE`.
-    - `solver`: by default the guided step with its exact discrete weight. An Itô diffrax solver steps the guided drift
-      instead, with the continuous-time weight: consistent as dt → 0, biased at fixed dt, and no target for MCMC. A
-      Stratonovich solver is refused unless both readings of the SDE coincide.
+    - `num_steps`, or `ts`: the number of steps of the default grid, or an increasing grid `(K +
+      1,)` from t0 to t1. The default is uniform, and graded towards t1, t = s(2 − s/T), where the
+      end state is pinned. A grid whose steps vanish in the precision used is refused.
+    - `guide`: by default `FrozenGuide()` where a is constant, `GeodesicGuide()` for a Kunita flow,
+      `RecedingGuide()` where a depends on the state otherwise, both with `rounds=2` for a
+      `SemilinearSDE`.
+    - `solver`: by default the guided step with its exact discrete weight. An Itô diffrax solver
+      steps the guided drift instead, with the continuous-time weight: consistent as dt → 0, biased
+      at fixed dt, and no target for MCMC. A Stratonovich solver is refused unless both readings of
+      the SDE coincide.
 
     **Errors:** `ValueError` for shapes, grids, data and combinations that cannot be meant.
     """
@@ -97,7 +104,9 @@ class GuidedBridge(eqx.Module):
     guide: AbstractGuide
     solver: diffrax.AbstractSolver
     flat: "GuidedBridge | None"
-    """The bridge that is computed where the condition is approximated: its states are those of this, flattened."""
+    """The bridge that is computed where the condition is approximated: its states are those of
+    this, flattened.
+    """
 
     def __init__(
         self,
@@ -114,13 +123,15 @@ class GuidedBridge(eqx.Module):
     ):
         require(
             isinstance(condition, AbstractCondition),
-            f"`condition` must be a condition, such as `InexactMatch(variance).at(v)`; got {type(condition).__name__}.",
+            "`condition` must be a condition, such as `InexactMatch(variance).at(v)`; got "
+            f"{type(condition).__name__}.",
         )
         require_instance(sde, AbstractSDE, "sde", "an SDE, such as `LinearSDE(drift, diffusion)`")
         x0 = as_float(x0, "x0")
         require(
             x0.ndim in (1, 2) and x0.size,
-            f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Use vmap for a batch.",
+            f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Use vmap for a "
+            "batch.",
         )
         require_finite(x0, "x0")
         grid = time_grid(t0, t1, num_steps, ts, graded=condition.exact)
@@ -133,7 +144,9 @@ class GuidedBridge(eqx.Module):
         condition = condition.anchored(sde, lambda: law_of_end(sde, x0, clock + grid.elapsed))
         if guide is None:
             guide = default_guide(sde, x0)
-            guide = FrozenGuide() if solver is not None and isinstance(guide, FrozenGuide) else guide
+            guide = (
+                FrozenGuide() if solver is not None and isinstance(guide, FrozenGuide) else guide
+            )
         require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         self.sde, self.condition, self.x0 = sde, condition, x0
         self.grid, self.clock, self.flat = grid, clock, None
@@ -141,7 +154,9 @@ class GuidedBridge(eqx.Module):
         if condition.is_approximated and x0.ndim == 2:
             flat = Flattened(sde, x0.shape[1])
             self.guide = guide
-            self.flat = GuidedBridge(flat, condition, x0=x0.reshape(-1), ts=grid, guide=guide, solver=solver)
+            self.flat = GuidedBridge(
+                flat, condition, x0=x0.reshape(-1), ts=grid, guide=guide, solver=solver
+            )
             sde.check_end(lambda: condition.reference(sde, x0))
             return
         guide.check(sde, x0)
@@ -154,13 +169,18 @@ class GuidedBridge(eqx.Module):
     def _check_solver(self):
         name = type(self.solver).__name__
         require(
-            isinstance(self.solver, diffrax.AbstractItoSolver) or self.sde.ito_is_stratonovich(self.x0),
-            f"`solver` must be an Itô solver (diffrax.Euler, diffrax.ItoMilstein); got {name}. Guided proposals and "
-            "their weights are Itô statements, and this SDE's Stratonovich reading is another process.",
+            isinstance(self.solver, diffrax.AbstractItoSolver)
+            or self.sde.ito_is_stratonovich(self.x0),
+            f"`solver` must be an Itô solver (diffrax.Euler, diffrax.ItoMilstein); got {name}. "
+            "Guided proposals and their weights are Itô statements, and this SDE's Stratonovich "
+            "reading is another process.",
         )
         require(
-            isinstance(self.solver, (diffrax.AbstractItoSolver, diffrax.AbstractStratonovichSolver)),
-            f"`solver` must be a diffrax solver for SDEs, such as `diffrax.Euler()`; got {self.solver!r}.",
+            isinstance(
+                self.solver, (diffrax.AbstractItoSolver, diffrax.AbstractStratonovichSolver)
+            ),
+            "`solver` must be a diffrax solver for SDEs, such as `diffrax.Euler()`; got "
+            f"{self.solver!r}.",
         )
         if not self._is_discrete:
             frame, _, seen, reference, ts = self.problem()
@@ -172,9 +192,10 @@ class GuidedBridge(eqx.Module):
                 gap = jnp.max(jnp.abs(promote(a, ndim, m) - promote(a_aux, ndim, m)))
                 require(
                     gap <= 1e-5 * jnp.max(jnp.abs(a)),
-                    "`auxiliary` must match the SDE at the observed end, L ã(T) Lᵀ = L a(T, v) Lᵀ, for the continuous "
-                    f"weight of an exact match: they differ by {concrete(gap)}, which gives finite and wrong weights. "
-                    "Use `FrozenGuide()` without an auxiliary, the default solver, or an inexact match.",
+                    "`auxiliary` must match the SDE at the observed end, L ã(T) Lᵀ = L a(T, v) "
+                    "Lᵀ, for the continuous weight of an exact match: they differ by "
+                    f"{concrete(gap)}, which gives finite and wrong weights. Use `FrozenGuide()` "
+                    "without an auxiliary, the default solver, or an inexact match.",
                 )
 
     def _check_exact(self):
@@ -187,10 +208,11 @@ class GuidedBridge(eqx.Module):
             pivots = jnp.diagonal(pivots) if S.ndim == 2 else pivots
             scale = jnp.sqrt(jnp.max(jnp.abs(S)))
             require(
-                jnp.all(pivots > 1e-7 * scale),  # of variances 1e-14: a singular matrix has pivots of rounding
-                "`condition` is an exact match, which needs noise in every observed direction, and the covariance of "
-                "the last step, L a Lᵀ dt, is singular: an observed component has no noise of its own. Use "
-                "`InexactMatch` with a small variance.",
+                # of variances 1e-14: a singular matrix has pivots of rounding
+                jnp.all(pivots > 1e-7 * scale),
+                "`condition` is an exact match, which needs noise in every observed direction, "
+                "and the covariance of the last step, L a Lᵀ dt, is singular: an observed "
+                "component has no noise of its own. Use `InexactMatch` with a small variance.",
             )
 
     @property
@@ -214,19 +236,29 @@ class GuidedBridge(eqx.Module):
 
     @property
     def noise_shape(self) -> tuple[int, int, int]:
-        """(num_steps, k, dim): k noises per coordinate. A `CylinderSet` has one row more, to draw its point."""
+        """(num_steps, k, dim): k noises per coordinate. A `CylinderSet` has one row more, to draw
+        its point.
+        """
         k = self.sde.noise_size(self.x0)
         if not self._is_discrete and issubclass(levy_area(self.solver), diffrax.SpaceTimeLevyArea):
             k = 2 * k
-        return self.num_steps + self.condition.num_extra_noises, k, self.x0.shape[1] if self.x0.ndim == 2 else 1
+        return (
+            self.num_steps + self.condition.num_extra_noises,
+            k,
+            self.x0.shape[1] if self.x0.ndim == 2 else 1,
+        )
 
     def with_guide(self, guide: AbstractGuide) -> "GuidedBridge":
         """The same bridge, led by another guide: the same estimand."""
-        return GuidedBridge(self.sde, self.condition, x0=self.x0, ts=self.grid, guide=guide, solver=self.solver)
+        return GuidedBridge(
+            self.sde, self.condition, x0=self.x0, ts=self.grid, guide=guide, solver=self.solver
+        )
 
     @_pure_method
     def path(self, noise: Float[Array, "K k dim"]) -> Float[Array, "K+1 n *dim"]:
-        """The states at `ts`, the first being x0. Weighted by exp(log_weight(noise)) it has the conditioned law."""
+        """The states at `ts`, the first being x0. Weighted by exp(log_weight(noise)) it has the
+        conditioned law.
+        """
         return self._run(noise)[0]
 
     @_pure_method
@@ -245,13 +277,15 @@ class GuidedBridge(eqx.Module):
         noise = as_float(noise, "noise").astype(self.x0.dtype)
         require(
             jnp.shape(noise) == self.noise_shape,
-            f"`noise` must have shape {self.noise_shape}, one noise for one path; got {jnp.shape(noise)}. "
-            "Use vmap for a batch.",
+            f"`noise` must have shape {self.noise_shape}, one noise for one path; got "
+            f"{jnp.shape(noise)}. Use vmap for a batch.",
         )
         return noise
 
     def _split(self, noise):
-        """Rows that choose the target, rows that drive the steps; columns dropped for vector states."""
+        """Rows that choose the target, rows that drive the steps; columns dropped for vector
+        states.
+        """
         noise = self._driving(noise)
         noise = noise[..., 0] if self.x0.ndim == 1 else noise
         extra = self.condition.num_extra_noises
@@ -260,7 +294,11 @@ class GuidedBridge(eqx.Module):
     def _drawn(self, extra) -> "GuidedBridge":
         """With what the rows of extra noise choose of the condition."""
         condition = self.condition.drawn(extra)
-        return self if condition is self.condition else eqx.tree_at(lambda b: b.condition, self, condition)
+        return (
+            self
+            if condition is self.condition
+            else eqx.tree_at(lambda b: b.condition, self, condition)
+        )
 
     def end(self) -> tuple[Observation, State]:
         """What is seen of the end state, and a state that meets the condition."""
@@ -279,9 +317,11 @@ class GuidedBridge(eqx.Module):
         return seen, reference
 
     def problem(self, x: State | None = None, since: RealScalar = 0.0) -> Problem:
-        """What is computed, for a path from x at the time `since`, which has elapsed; from the start if not given.
+        """What is computed, for a path from x at the time `since`, which has elapsed; from the
+        start if not given.
 
-        In displacements from a state that meets the condition, what is exactly seen keeps its digits to the end.
+        In displacements from a state that meets the condition, what is exactly seen keeps its
+        digits to the end.
         """
         seen, end = self.end()
         x = self.x0 if x is None else x
@@ -295,13 +335,19 @@ class GuidedBridge(eqx.Module):
 
     def observed(self) -> State:
         """The value that is observed; `ValueError` for a set."""
-        require(self.condition.num_extra_noises == 0, "`condition` is a set, which has no observed value.")
+        require(
+            self.condition.num_extra_noises == 0,
+            "`condition` is a set, which has no observed value.",
+        )
         return self.condition.target(self.x0, jnp.ones(()), jnp.zeros((0,))).value
 
     def _before_the_end(self, t, x) -> tuple[Array, State]:
         """The time that has elapsed at t, and x, checked."""
         x = as_float(x, "x")
-        require(x.shape == self.x0.shape, f"`x` must be one state, {self.x0.shape}; got shape {x.shape}. Use vmap.")
+        require(
+            x.shape == self.x0.shape,
+            f"`x` must be one state, {self.x0.shape}; got shape {x.shape}. Use vmap.",
+        )
         elapsed = self.grid.since(t)
         require(elapsed.ndim == 0, f"`t` must be one time; got shape {elapsed.shape}. Use vmap.")
         require(
@@ -312,12 +358,15 @@ class GuidedBridge(eqx.Module):
 
     @_pure_method
     def log_h(self, t: RealScalar, x: State) -> Float[Array, ""]:
-        """log h̃(t, x) of the guide, t before t1: log density of the datum, or log probability of the set, from x."""
+        """log h̃(t, x) of the guide, t before t1: log density of the datum, or log probability of
+        the set, from x.
+        """
         return self._log_h_and_score(*self._before_the_end(t, x))[0]
 
     @_pure_method
     def score(self, t: RealScalar, x: State) -> State:
-        """∇ log h̃(t, x), the guide's covariance held fixed: where the path is pulled, before a(x) acts on it.
+        """∇ log h̃(t, x), the guide's covariance held fixed: where the path is pulled, before a(x)
+        acts on it.
 
         A learned guide's network is in it.
         """
@@ -325,16 +374,23 @@ class GuidedBridge(eqx.Module):
 
     @_pure_method
     def scores(self, path: Float[Array, "K+1 n *dim"]) -> Float[Array, "K n *dim"]:
-        """∇ log h̃ at the grid times, the end left out, from the states of a path: one plan for all of them."""
+        """∇ log h̃ at the grid times, the end left out, from the states of a path: one plan for all
+        of them.
+        """
         path = as_float(path, "path").astype(self.x0.dtype)
         shape = (self.num_steps + 1, *self.x0.shape)
-        require(path.shape == shape, f"`path` must have shape {shape}; got {path.shape}. Use vmap for a batch.")
+        require(
+            path.shape == shape,
+            f"`path` must have shape {shape}; got {path.shape}. Use vmap for a batch.",
+        )
         return self._scores(path)
 
     @eqx.filter_jit
     @full_precision
     def _log_h_and_score(self, since, x: State) -> tuple[Float[Array, ""], State]:
-        """The time is put into the grid behind t0; steps before it have no length and change nothing."""
+        """The time is put into the grid behind t0; steps before it have no length and change
+        nothing.
+        """
         if self.flat is not None:
             value, score = self.flat._log_h_and_score(since, x.reshape(-1))
             return value, score.reshape(x.shape)
@@ -372,7 +428,9 @@ class GuidedBridge(eqx.Module):
         message = self._message(problem, plan, entry, t, y)
 
         def log_h(y):
-            return problem.condition.log_value(apply(message.operator, y) + message.shift, message.factor)
+            return problem.condition.log_value(
+                apply(message.operator, y) + message.shift, message.factor
+            )
 
         value, score = jax.value_and_grad(log_h)(y)
         if plan is not None:
@@ -384,7 +442,9 @@ class GuidedBridge(eqx.Module):
         if extra.shape[0] == 0:
             return problem.condition.target(start, jnp.ones(()), extra)
         message = self._start(problem, plan)
-        return problem.condition.target(apply(message.operator, start) + message.shift, message.factor, extra)
+        return problem.condition.target(
+            apply(message.operator, start) + message.shift, message.factor, extra
+        )
 
     def _start(self, problem: Problem, plan) -> GaussianMessage:
         """The forecast at t0."""
@@ -420,7 +480,9 @@ class GuidedBridge(eqx.Module):
         v = target.value
         if plan is None:
             auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
-            path, log_weight = travel_continuous(frame.sde, auxiliary, self.solver, seen, ts, frame.start, noise, v)
+            path, log_weight = travel_continuous(
+                frame.sde, auxiliary, self.solver, seen, ts, frame.start, noise, v
+            )
         else:
             path, log_weight = reach(frame.sde, plan, seen, ts, frame.start, noise, v)
         path = frame.origins[1:] + path
@@ -433,26 +495,33 @@ class GuidedBridge(eqx.Module):
     def guided_terms(
         self, noise: Float[Array, "K k dim"]
     ) -> tuple[GuidedTerm, Float[Array, " K"], Float[Array, "K+1 n *dim"]]:
-        """What `diffrax.diffeqsolve` solves by `GuidedStep()`: every step but the last, which is onto the observation.
+        """What `diffrax.diffeqsolve` solves by `GuidedStep()`: every step but the last, which is
+        onto the observation.
 
             terms, ts, origins = bridge.guided_terms(noise)
             start = (bridge.x0 - origins[0], 0.0)
             diffrax.diffeqsolve(terms, nb.GuidedStep(), ts[0], ts[-1], None, start,
                                 stepsize_controller=diffrax.StepTo(ts))
 
-        **Returns:** the terms, times that have elapsed, `(K,)`, and the origins of which states are displacements, at
-        all times of the grid. The solution is the displacement of the last state but one, and its log weight.
+        **Returns:** the terms, times that have elapsed, `(K,)`, and the origins of which states are
+        displacements, at all times of the grid. The solution is the displacement of the last state
+        but one, and its log weight.
 
-        **Errors:** `ValueError` for a set, whose target is drawn, and for a bridge with another `solver`.
+        **Errors:** `ValueError` for a set, whose target is drawn, and for a bridge with another
+        `solver`.
         """
         require(self._is_discrete, "`guided_terms` needs the guided step: the default `solver`.")
         require(
             self.flat is None,
-            "`guided_terms` are of the bridge `flat`, whose states are flattened: this condition is approximated.",
+            "`guided_terms` are of the bridge `flat`, whose states are flattened: this condition "
+            "is approximated.",
         )
         _, noise = self._split(noise)
         frame, condition, _, _, ts = problem = self.problem()
-        require(condition.num_extra_noises == 0, "`condition` is a set, whose target `guided_terms` does not draw.")
+        require(
+            condition.num_extra_noises == 0,
+            "`condition` is a set, whose target `guided_terms` does not draw.",
+        )
         plan = self._plan(problem)
         assert plan is not None
         observed = self._target(problem, plan, noise[:0]).value
@@ -461,14 +530,16 @@ class GuidedBridge(eqx.Module):
     def noise_from_path(
         self, path: Float[Array, "K+1 n *dim"], key: PRNGKeyArray | None = None
     ) -> Float[Array, "K k dim"]:
-        """The noise with `path(noise) = path`, for a path that starts at x0 and meets the condition.
+        """The noise with `path(noise) = path`, for a path that starts at x0 and meets the
+        condition.
 
-        Where several noises give the same path (more noises than states, an exactly observed end) the part that the
-        path leaves free is drawn with `key`, from its law under the model; it is 0 without a key. The path is given by
-        its states, whose digits limit those of the noise: in single precision, near an exact end, there may be few.
+        Where several noises give the same path (more noises than states, an exactly observed end)
+        the part that the path leaves free is drawn with `key`, from its law under the model; it is
+        0 without a key. The path is given by its states, whose digits limit those of the noise: in
+        single precision, near an exact end, there may be few.
 
-        **Errors:** `ValueError` for a path that does not start at x0, or whose end is not the exact datum or outside
-        the set.
+        **Errors:** `ValueError` for a path that does not start at x0, or whose end is not the exact
+        datum or outside the set.
         """
         require(self._is_discrete, "`noise_from_path` needs the guided step: the default `solver`.")
         path = as_float(path, "path").astype(self.x0.dtype)
@@ -480,19 +551,22 @@ class GuidedBridge(eqx.Module):
         return self._retrace(path, key)
 
     def _check_ends(self, path):
-        """A path of another bridge has other ends. To single precision, in which it may have been kept."""
+        """A path of another bridge has other ends. To single precision, in which it may have been
+        kept.
+        """
         near = 1e-6 * jnp.max(jnp.abs(path))
         start = jnp.max(jnp.abs(path[0] - self.x0))
         require(
             start <= near,
-            f"`path` must start at `x0`; its first state is {concrete(start)} away from it. Use the bridge from there.",
+            f"`path` must start at `x0`; its first state is {concrete(start)} away from it. Use "
+            "the bridge from there.",
         )
         if self.condition.exact:
             end = jnp.max(jnp.abs(path[-1] - self.condition.reference(self.sde, path[-1])))
             require(
                 end <= near,
-                f"`path` must end where `condition` is met; its last state is {concrete(end)} away from there. Use the "
-                "bridge to what is seen of its end.",
+                f"`path` must end where `condition` is met; its last state is {concrete(end)} "
+                "away from there. Use the bridge to what is seen of its end.",
             )
 
     @eqx.filter_jit
@@ -509,7 +583,11 @@ class GuidedBridge(eqx.Module):
         plan = self._plan(problem)
         assert plan is not None
         y = (path - frame.origins).at[0].set(frame.start)
-        observed = apply(seen.operator, y[-1]) if seen.exact else self._target(problem, plan, jnp.zeros((0,))).value
+        observed = (
+            apply(seen.operator, y[-1])
+            if seen.exact
+            else self._target(problem, plan, jnp.zeros((0,))).value
+        )
         z = retrace_reach(frame.sde, plan, seen, ts, y, observed, key)
         if condition.num_extra_noises:
             message = self._start(problem, plan)

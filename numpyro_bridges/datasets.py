@@ -1,4 +1,6 @@
-"""Small sets of shapes for examples and tests, aligned and of unit size, and the tree of one of them."""
+"""Small sets of shapes for examples and tests, aligned and of unit size, and the tree of one of
+them.
+"""
 
 import csv
 import importlib.util
@@ -39,14 +41,15 @@ class Shapes:
 def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
     """Outlines of mosquito wings (Rohlf & Archie 1984), from the package `ktch`.
 
-    126 specimens: 57 of genus `"AE"`, 25 of `"CX"`, 12 of `"PS"`, 11 of `"AN"`, 7 of `"CA"`, 4 of `"UR"`, 4
-    of `"WY"`, 3 of `"MA"`, 1 each of `"DE"`, `"OR"`, `"TO"` (the source's codes: *Aedes*, *Culex*, ...).
+    126 specimens: 57 of genus `"AE"`, 25 of `"CX"`, 12 of `"PS"`, 11 of `"AN"`, 7 of `"CA"`, 4 of
+    `"UR"`, 4 of `"WY"`, 3 of `"MA"`, 1 each of `"DE"`, `"OR"`, `"TO"` (the source's codes: *Aedes*,
+    *Culex*, ...).
 
-    The source gives 100 points of each outline at equal polar angles, which crowds them in the middle of a
-    long wing; here they are at equal arc length. The first point of every outline is the corner at the wing's
-    hinge; they run counter-clockwise. Shapes are aligned within the selection by rotations, so the same wing
-    is turned a little differently in another selection. The long axis of the mean lies on the x-axis, the
-    hinge at positive x.
+    The source gives 100 points of each outline at equal polar angles, which crowds them in the
+    middle of a long wing; here they are at equal arc length. The first point of every outline is
+    the corner at the wing's hinge; they run counter-clockwise. Shapes are aligned within the
+    selection by rotations, so the same wing is turned a little differently in another selection.
+    The long axis of the mean lies on the x-axis, the hinge at positive x.
 
     **Arguments:**
 
@@ -63,9 +66,15 @@ def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
         genera = {row["specimen_id"]: row["genus"] for row in csv.DictReader(file)}
     chosen = [specimen for specimen, its in genera.items() if genus is None or str(genus) == its]
     if not chosen:
-        available = ", ".join(f"{name!r} ({count})" for name, count in Counter(genera.values()).most_common())
-        raise ValueError(f"`genus` must be one of {available}, or None for all; got {words(genus)}.")
-    specimen, _, *xy = np.loadtxt(folder / "data_outline_mosquito_wings.csv", delimiter=",", skiprows=1, unpack=True)
+        available = ", ".join(
+            f"{name!r} ({count})" for name, count in Counter(genera.values()).most_common()
+        )
+        raise ValueError(
+            f"`genus` must be one of {available}, or None for all; got {words(genus)}."
+        )
+    specimen, _, *xy = np.loadtxt(
+        folder / "data_outline_mosquito_wings.csv", delimiter=",", skiprows=1, unpack=True
+    )
     outlines = [np.stack(xy, axis=1)[specimen == int(name)] for name in chosen]
     labels = tuple(genera[name] for name in chosen)
     names = tuple(f"{label} {name}" for label, name in zip(labels, chosen, strict=True))
@@ -76,25 +85,29 @@ def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
 def mosquito_tree() -> Tree:
     """The tree of the 11 genera of `mosquito_wings`, one unit high, its tips named by their codes.
 
-    *Anopheles* `AN`, *Uranotaenia* `UR`, *Toxorhynchites* `TO`, *Wyeomyia* `WY`, *Mansonia* `MA`, *Orthopodomyia* `OR`,
-    *Culiseta* `CA`, *Culex* `CX`, *Deinocerites* `DE`, *Psorophora* `PS`, *Aedes* `AE`. The source of the wings gives
-    codes alone; they come in the usual order of the genera, in which *Culiseta* stands where `CA` does. Inner nodes
-    with a name are `Culicinae`, `Culicini` and `Aedini`.
+    *Anopheles* `AN`, *Uranotaenia* `UR`, *Toxorhynchites* `TO`, *Wyeomyia* `WY`, *Mansonia* `MA`,
+    *Orthopodomyia* `OR`, *Culiseta* `CA`, *Culex* `CX`, *Deinocerites* `DE`, *Psorophora* `PS`,
+    *Aedes* `AE`. The source of the wings gives codes alone; they come in the usual order of the
+    genera, in which *Culiseta* stands where `CA` does. Inner nodes with a name are `Culicinae`,
+    `Culicini` and `Aedini`.
 
-    The topology is that of the amino acids of 709 genes in 256 species (Soghigian and others 2023), pruned to these
-    genera [@soghigian2023]. There *Deinocerites* lies within *Culex*, and *Aedes* holds genera that are not here.
+    The topology is that of the amino acids of 709 genes in 256 species (Soghigian and others 2023),
+    pruned to these genera [@soghigian2023]. There *Deinocerites* lies within *Culex*, and *Aedes*
+    holds genera that are not here.
 
-    **Lengths are no dates.** They are those of Grafen (1989): a node with n tips below it lies (n − 1)/10 before the
-    present [@grafen1989]. Rates per unit of time are rates per height of this tree.
+    **Lengths are no dates.** They are those of Grafen (1989): a node with n tips below it lies (n −
+    1)/10 before the present [@grafen1989]. Rates per unit of time are rates per height of this
+    tree.
     """
     return Tree.from_newick(_MOSQUITO_TREE)
 
 
 def ellipses(num_points: int = 32, aspects: Sequence[float] = (1.0, 1.25, 1.5, 2.0)) -> Shapes:
-    """Ellipses with the given ratios of their axes: the smallest set to try a model on, without a download.
+    """Ellipses with the given ratios of their axes: the smallest set to try a model on, without a
+    download.
 
-    Points are at equal arc length, counter-clockwise from the end of the long axis at positive x (for a ratio
-    below 1, the short one). Labels are the ratios.
+    Points are at equal arc length, counter-clockwise from the end of the long axis at positive x
+    (for a ratio below 1, the short one). Labels are the ratios.
 
     **Arguments:**
 
@@ -106,7 +119,9 @@ def ellipses(num_points: int = 32, aspects: Sequence[float] = (1.0, 1.25, 1.5, 2
     num_points = positive_integer(num_points, "num_points", least=3)
     ratios = known_float(aspects, "aspects")
     if ratios.ndim != 1 or ratios.size == 0 or not np.all((ratios >= 1e-6) & (ratios <= 1e6)):
-        raise ValueError(f"`aspects` must be one or more ratios from 1e-6 to 1e6; got {words(aspects)}.")
+        raise ValueError(
+            f"`aspects` must be one or more ratios from 1e-6 to 1e6; got {words(aspects)}."
+        )
     angles = np.linspace(0.0, 2.0 * np.pi, 100 * num_points, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     labels = tuple(f"{aspect:g}" for aspect in ratios)
@@ -114,13 +129,17 @@ def ellipses(num_points: int = 32, aspects: Sequence[float] = (1.0, 1.25, 1.5, 2
     return _in_register(points, labels, tuple(f"ellipse {label}" for label in labels))
 
 
-def _in_register(points: Sequence[NDArray], labels: tuple[str, ...], names: tuple[str, ...]) -> Shapes:
+def _in_register(
+    points: Sequence[NDArray], labels: tuple[str, ...], names: tuple[str, ...]
+) -> Shapes:
     alignment = procrustes_align(np.stack(points))
     return Shapes(alignment.shapes, alignment.mean, labels, names)
 
 
 def _along_x(shapes: Shapes) -> Shapes:
-    """Turned so that the long axis of the mean is the x-axis and its first point lies at positive x."""
+    """Turned so that the long axis of the mean is the x-axis and its first point lies at positive
+    x.
+    """
     _, _, axes = np.linalg.svd(shapes.mean)
     axes[0] *= np.sign(shapes.mean[0] @ axes[0])
     turn = np.stack([axes[0], [-axes[0, 1], axes[0, 0]]], axis=1)
@@ -133,6 +152,7 @@ def _ktch_data() -> Path:
     folders = spec.submodule_search_locations if spec is not None else None
     if not folders:
         raise ImportError(
-            "The outlines are in the package `ktch`, which is not installed: pip install 'numpyro_bridges[examples]'"
+            "The outlines are in the package `ktch`, which is not installed: pip install "
+            "'numpyro_bridges[examples]'"
         )
     return Path(folders[0]) / "datasets" / "data"

@@ -17,11 +17,13 @@ from .bridges import GuidedBridge
 
 
 class EvidenceEstimate(eqx.Module):
-    """An estimate of log p(condition | x0). `str` of it says whether it is to be trusted, and if not, why.
+    """An estimate of log p(condition | x0). `str` of it says whether it is to be trusted, and if
+    not, why.
 
-    - `log_evidence`: log of the mean weight, unsmoothed: the mean is unbiased, its log too low by about SE²/2.
-    - `standard_error`: of it, in nats, what the drawn weights have missed of the tail included; `inf` where
-      nothing can be said of it (`weights.standard_error`).
+    - `log_evidence`: log of the mean weight, unsmoothed: the mean is unbiased, its log too low by
+      about SE²/2.
+    - `standard_error`: of it, in nats, what the drawn weights have missed of the tail included;
+      `inf` where nothing can be said of it (`weights.standard_error`).
     - `ess`: the effective number of particles.
     - `pareto_k`: k̂, the shape of the weights' tail; −inf where all are equal to rounding.
     - `rounding`: what rounding may account for in a log weight, in nats.
@@ -39,8 +41,8 @@ class EvidenceEstimate(eqx.Module):
     def trusted(self) -> bool:
         """Whether `log_evidence` ± 2 `standard_error` can be taken at its word: both are finite.
 
-        The error is, where k̂ is below `weights.pareto_k_threshold(num_particles)`. A tail of which no path has
-        given a sign cannot be seen.
+        The error is, where k̂ is below `weights.pareto_k_threshold(num_particles)`. A tail of which
+        no path has given a sign cannot be seen.
         """
         return bool(jnp.isfinite(self.log_evidence) & jnp.isfinite(self.standard_error))
 
@@ -55,7 +57,10 @@ class EvidenceEstimate(eqx.Module):
         if not math.isfinite(self.log_evidence):
             return f"the log evidence is {self.log_evidence:.2f}"
         if math.isinf(self.pareto_k):
-            return f"the tail of {num_particles} particles has no shape: too few, or nearly all of weight 0"
+            return (
+                f"the tail of {num_particles} particles has no shape: too few, or nearly all of "
+                "weight 0"
+            )
         threshold = weights.pareto_k_threshold(num_particles)
         if self.pareto_k < threshold:
             return f"k̂ = {self.pareto_k:.2f}, of a tail of few weights"
@@ -63,7 +68,9 @@ class EvidenceEstimate(eqx.Module):
 
     def __str__(self) -> str:
         found = f"log evidence {self.log_evidence:.4g} ± {self.standard_error:.2g}"
-        quality = f"ESS {self.ess:.4g} of {self.log_weights.shape[0]} particles, k̂ {self.pareto_k:.2f}"
+        quality = (
+            f"ESS {self.ess:.4g} of {self.log_weights.shape[0]} particles, k̂ {self.pareto_k:.2f}"
+        )
         verdict = "" if self.trusted else f". Not to be trusted: {self.doubt}"
         return f"{found} ({quality}){verdict}"
 
@@ -78,8 +85,9 @@ def estimate_evidence(
 ) -> EvidenceEstimate:
     """Estimate p(condition | x0) from independent guided paths.
 
-    **Arguments:** `num_particles`: number of paths, at least 2. `batch_size`: how many a device runs at once; memory is
-    bounded by it. `mesh`: the devices that share the paths, as for `spread`.
+    **Arguments:** `num_particles`: number of paths, at least 2. `batch_size`: how many a device
+    runs at once; memory is bounded by it. `mesh`: the devices that share the paths, as for
+    `spread`.
 
     **Returns:** an `EvidenceEstimate`. A path that failed numerically makes it NaN.
     """
@@ -99,7 +107,7 @@ def timed_estimate(
     batch_size: int,
     mesh: Mesh | None,
 ) -> tuple[EvidenceEstimate, float]:
-    """The same, of any number of particles, and the seconds that the paths took after compilation."""
+    """The same, of any number of particles, and the seconds that paths took once compiled."""
     batches, mesh = _batches(key, num_particles, batch_size, mesh)
     for keys in {len(keys): keys for keys in batches}.values():
         jax.block_until_ready(_log_weights(bridge, keys, mesh))
@@ -113,11 +121,14 @@ def estimate_from(bridge: GuidedBridge, log_weights: Array) -> EvidenceEstimate:
     """What log weights of a bridge say of its evidence."""
     log_evidence = weights.log_mean_exp(log_weights)
     rounding = _rounding(bridge, float(log_evidence))
-    # Each of two log weights may be off by the rounding, and rounding errors have no tail to be judged by.
+    # Each of two log weights may be off by the rounding, and rounding errors have no tail to be
+    # judged by.
     equal = jnp.ptp(log_weights) <= 2 * rounding
     judged = jnp.where(equal, log_evidence, log_weights)
     standard_error, ess, pareto_k = weights.quality(judged)
-    return EvidenceEstimate(log_evidence, standard_error, ess, float(pareto_k), rounding, log_weights)
+    return EvidenceEstimate(
+        log_evidence, standard_error, ess, float(pareto_k), rounding, log_weights
+    )
 
 
 def driving_noise(bridge: GuidedBridge, key: PRNGKeyArray) -> Array:

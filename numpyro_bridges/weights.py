@@ -1,10 +1,10 @@
 """Arithmetic on the log weights of importance samples.
 
-Every function takes an array of log weights whose last axis runs over the particles, and reduces that axis.
-A weight of zero (`-inf`) is a weight like any other. A NaN weight is a failure of whatever computed it and
-makes the result NaN, so that it is never mistaken for a weight of zero; an infinite weight does the same,
-except to the mean, which it makes infinite. What is no array of numbers with a particle on that axis is a
-`ValueError`.
+Every function takes an array of log weights whose last axis runs over the particles, and reduces
+that axis. A weight of zero (`-inf`) is a weight like any other. A NaN weight is a failure of
+whatever computed it and makes the result NaN, so that it is never mistaken for a weight of zero; an
+infinite weight does the same, except to the mean, which it makes infinite. What is no array of
+numbers with a particle on that axis is a `ValueError`.
 """
 
 import math
@@ -46,23 +46,26 @@ def effective_sample_size(log_weights: Float[Array, "... S"]) -> Float[Array, ".
 
 
 def standard_error(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
-    """Standard error of `log_mean_exp`, for the weights that were drawn and for those that were not.
+    """Standard error of `log_mean_exp`, for the weights that were drawn and for those that were
+    not.
 
         error² = sd(w)² / (S mean(w)²) + missing²
         missing = σ n^κ / ((1 − κ)² S mean(w)),    κ = k̂ + (1 + max(k̂, 0)) / √n
 
-    The first term is the delta method. It is small above all in those samples that have missed the tail, and
-    so is k̂, which is why no bound on k̂ alone makes its intervals cover. The second is what the tail fitted by
-    `pareto_k` to the n largest weights, of shape k̂ and scale σ, holds beyond the largest to be expected of n,
-    σ n^κ / (1 − κ) / S, with its shape raised by one standard error; it is divided by 1 − κ once more, since
-    near κ = 1 that part is as uncertain as it is large. Under light tails it is negligible.
+    The first term is the delta method. It is small above all in those samples that have missed the
+    tail, and so is k̂, which is why no bound on k̂ alone makes its intervals cover. The second is
+    what the tail fitted by `pareto_k` to the n largest weights, of shape k̂ and scale σ, holds
+    beyond the largest to be expected of n, σ n^κ / (1 − κ) / S, with its shape raised by one
+    standard error; it is divided by 1 − κ once more, since near κ = 1 that part is as uncertain as
+    it is large. Under light tails it is negligible.
 
     **Arguments:**
 
     - `log_weights`: log weights, particles along the last axis.
 
     **Returns:** the standard error in nats. `inf` where nothing can be said of it: where k̂ reaches
-    `pareto_k_threshold`, κ reaches 1, no tail can be fitted, or every weight is zero. NaN for a single particle.
+    `pareto_k_threshold`, κ reaches 1, no tail can be fitted, or every weight is zero. NaN for a
+    single particle.
     """
     return _standard_error(_checked(log_weights))
 
@@ -70,20 +73,22 @@ def standard_error(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
 def pareto_k(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
     """Shape k̂ of the generalised Pareto distribution fitted to the largest weights.
 
-    Moments of order 1/k and more are infinite: from k = 1/2 on the weights have no variance, from k = 1 on no
-    mean. The estimate of their mean and its `standard_error` are reliable up to `pareto_k_threshold`.
+    Moments of order 1/k and more are infinite: from k = 1/2 on the weights have no variance, from k
+    = 1 on no mean. The estimate of their mean and its `standard_error` are reliable up to
+    `pareto_k_threshold`.
 
-    The tail is the ⌈min(S/5, 3 √S)⌉ largest weights, as exceedances over the next smaller one; its shape is
-    the estimate of Zhang and Stephens, shrunk towards 1/2 as by ten further weights. All is kept in
-    logarithms, so weights that differ by hundreds of nats still have a shape (a large one).
+    The tail is the ⌈min(S/5, 3 √S)⌉ largest weights, as exceedances over the next smaller one; its
+    shape is the estimate of Zhang and Stephens, shrunk towards 1/2 as by ten further weights. All
+    is kept in logarithms, so weights that differ by hundreds of nats still have a shape (a large
+    one).
 
     **Arguments:**
 
     - `log_weights`: log weights, particles along the last axis.
 
-    **Returns:** k̂. `-inf` where the largest weights are all equal: they are bounded, and harmless. `inf`
-    where no shape can be fitted, with fewer than five weights above the cutoff: below 21 particles, or with
-    nearly all weights zero.
+    **Returns:** k̂. `-inf` where the largest weights are all equal: they are bounded, and harmless.
+    `inf` where no shape can be fitted, with fewer than five weights above the cutoff: below 21
+    particles, or with nearly all weights zero.
 
     **Source:** [@vehtari2024], [@zhang2009].
     """
@@ -98,8 +103,9 @@ def quality(log_weights: Float[Array, "... S"]) -> tuple[Array, Array, Array]:
 def pareto_k_threshold(num_particles: int) -> float:
     """The k̂ from which on an estimate from so many particles is not to be relied on.
 
-    0.7, beyond which no number of particles that can be had is enough; less where 1 is within one standard
-    error of k̂ on a tail of n weights: min((√n − 1) / (√n + 1), 0.7), which is 0.7 from 161 particles on.
+    0.7, beyond which no number of particles that can be had is enough; less where 1 is within one
+    standard error of k̂ on a tail of n weights: min((√n − 1) / (√n + 1), 0.7), which is 0.7 from
+    161 particles on.
 
     A lower bound is no safer: what passes it of heavier tails is the samples that have missed them.
 
@@ -178,7 +184,9 @@ def _tail_length(num_particles: int) -> int:
 
 @partial(jnp.vectorize, signature="(s)->(),(),()")
 def _tail(log_weights):
-    """Shape k̂ of the tail, the log of its scale σ, and the number n of weights that are above its cutoff."""
+    """Shape k̂ of the tail, the log of its scale σ, and the number n of weights that are above its
+    cutoff.
+    """
     num_particles = log_weights.shape[0]
     num_tail = _tail_length(num_particles)
     ordered = jnp.sort(log_weights)
@@ -188,20 +196,23 @@ def _tail(log_weights):
     exceeds = tail > cutoff
     num_exceed = jnp.sum(exceeds)
     n = num_exceed.astype(log_weights.dtype)
-    # log of the exceedances y = exp(tail) − exp(cutoff), ascending; the ties with the cutoff come first
+    # log of the exceedances y = exp(tail) − exp(cutoff), ascending; the ties with the cutoff come
+    # first
     log_y = tail + jnp.log1p(-jnp.exp(jnp.where(exceeds, cutoff - tail, -1.0)))
     log_y_max = log_y[-1]
     quartile = num_tail - num_exceed + jnp.maximum((num_exceed + 2) // 4 - 1, 0)
     log_y_quartile = log_y[jnp.minimum(quartile, num_tail - 1)]
 
-    # The rate b = 1/max(y) − a/quartile(y), in units of 1/quartile(y), and the mean of log(1 − b y), in a
-    # form that never overflows and, as b → 0, in one that stays proportional to b.
+    # The rate b = 1/max(y) − a/quartile(y), in units of 1/quartile(y), and the mean of log(1 − b
+    # y), in a form that never overflows and, as b → 0, in one that stays proportional to b.
     def rate(log_a):
         return jnp.exp(log_y_quartile - log_y_max) - jnp.exp(log_a)
 
     def mean_log(log_a):
         step = rate(log_a) * jnp.exp(log_y - log_y_quartile)
-        stable = jnp.logaddexp(log_a + log_y - log_y_quartile, jnp.log(-jnp.expm1(log_y - log_y_max)))
+        stable = jnp.logaddexp(
+            log_a + log_y - log_y_quartile, jnp.log(-jnp.expm1(log_y - log_y_max))
+        )
         terms = jnp.where(jnp.abs(step) < 0.5, jnp.log1p(-step), stable)
         return jnp.sum(jnp.where(exceeds, terms, 0.0)) / n
 

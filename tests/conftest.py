@@ -9,8 +9,8 @@ from pathlib import Path
 # Before JAX is imported: threads cost more than they give on the small matrices of the tests.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Half of the compile time of small programs, while JAX has this choice, and no parts for other threads. XLA stops at a
-# flag that it does not know.
+# Half of the compile time of small programs, while JAX has this choice, and no parts for other
+# threads. XLA stops at a flag that it does not know.
 if importlib.metadata.version("jaxlib").startswith("0.9."):
     os.environ.setdefault(
         "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
@@ -20,8 +20,8 @@ import jax
 import jax.random as jr
 import pytest
 
-# Tracing makes many small objects that live on: to look for garbage among them as often as by default takes a sixth of
-# the time of the suite.
+# Tracing makes many small objects that live on: to look for garbage among them as often as by
+# default takes a sixth of the time of the suite.
 gc.set_threshold(200_000, 20, 50)
 
 jax.config.update("jax_enable_x64", True)
@@ -33,15 +33,31 @@ NUMPYRO = ("test_distributions", "test_infer", "test_examples", "test_readme")
 # Modules whose few tests take longest.
 LONG = ("test_examples", "test_docs", "test_kunita", "test_reference")
 
-# Modules that show soonest what another version of Python, JAX, NumPyro or ArviZ breaks, each of them quick.
-SHORT = ("test_arviz", "test_drive", "test_infer_parts", "test_layers", "test_sample", "test_weights")
+# Modules that show soonest what another version of Python, JAX, NumPyro or ArviZ breaks, each of
+# them quick.
+SHORT = (
+    "test_arviz",
+    "test_drive",
+    "test_infer_parts",
+    "test_layers",
+    "test_sample",
+    "test_weights",
+)
 
 
 def pytest_addoption(parser):
-    parser.addoption("--slow", action="store_true", help="run the tests marked slow, which take minutes")
+    parser.addoption(
+        "--slow", action="store_true", help="run the tests marked slow, which take minutes"
+    )
     parser.addoption("--short", action="store_true", help=f"run {', '.join(SHORT)} alone")
-    parser.addoption("--bad-inputs", type=int, help="random bad inputs in all, others in each run (5000: minutes)")
-    parser.addoption("--seed", type=int, help="seed of the `key` fixture; by default a new one for each test")
+    parser.addoption(
+        "--bad-inputs",
+        type=int,
+        help="random bad inputs in all, others in each run (5000: minutes)",
+    )
+    parser.addoption(
+        "--seed", type=int, help="seed of the `key` fixture; by default a new one for each test"
+    )
 
 
 def pytest_ignore_collect(collection_path, config):
@@ -53,7 +69,8 @@ def pytest_ignore_collect(collection_path, config):
 
 
 def pytest_collection_modifyitems(config, items):
-    items.sort(key=lambda item: not item.path.name.startswith(LONG))  # first, so that both cores end together
+    # first, so that both cores end together
+    items.sort(key=lambda item: not item.path.name.startswith(LONG))
     if not config.getoption("--slow"):
         skip = pytest.mark.skip(reason="slow: run with --slow")
         for item in items:
@@ -72,7 +89,9 @@ def _promotion(request):
 
 @pytest.fixture(scope="module")
 def compile_quickly():
-    """For modules of many small programs that run once: `pytestmark = pytest.mark.usefixtures("compile_quickly")`."""
+    """For modules of many small programs that run once: `pytestmark =
+    pytest.mark.usefixtures("compile_quickly")`.
+    """
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

@@ -1,7 +1,8 @@
-"""Referees in plain NumPy: processes, conditions, guides and guided paths, written again from their formulas.
+"""Referees in plain NumPy: processes, conditions, guides and guided paths, written again from their
+formulas.
 
-Every state is `(n, dim)` here and every linear map a dense matrix; nothing is structured, and nothing is shared with
-the package.
+Every state is `(n, dim)` here and every linear map a dense matrix; nothing is structured, and
+nothing is shared with the package.
 """
 
 import contextlib
@@ -62,7 +63,9 @@ def linear_process(B, sigma, beta, n, dim=1, exact=True):
     dense, beta = as_matrix(B, n), np.broadcast_to(np.asarray(beta, float).reshape(-1, 1), (n, dim))
     sigma = as_matrix(sigma, n)
     small = B if np.ndim(B) == 0 else dense
-    return Process(lambda t, x: dense @ x + beta, lambda t, x: sigma, (small, beta, sigma) if exact else None)
+    return Process(
+        lambda t, x: dense @ x + beta, lambda t, x: sigma, (small, beta, sigma) if exact else None
+    )
 
 
 def as_matrix(a, n):
@@ -98,7 +101,10 @@ def log_normal(x, mean, covariance):
     r = x - mean
     sign, log_det = np.linalg.slogdet(covariance)
     assert sign > 0
-    return -0.5 * (np.sum(r * np.linalg.solve(covariance, r)) + r.shape[1] * (log_det + len(r) * np.log(2 * np.pi)))
+    return -0.5 * (
+        np.sum(r * np.linalg.solve(covariance, r))
+        + r.shape[1] * (log_det + len(r) * np.log(2 * np.pi))
+    )
 
 
 @dataclass(frozen=True)
@@ -136,9 +142,11 @@ class Condition:
 
 @dataclass(frozen=True)
 class Guide:
-    """`auxiliary` None: linearised at the reference. `receding`: the weight of the end, or None if frozen.
+    """`auxiliary` None: linearised at the reference. `receding`: the weight of the end, or None if
+    frozen.
 
-    `geodesic`: the part of the correction. `learned(t, x, reference, ts)` is what a network adds to the score.
+    `geodesic`: the part of the correction. `learned(t, x, reference, ts)` is what a network adds to
+    the score.
     """
 
     auxiliary: Process | None = None
@@ -192,14 +200,18 @@ class Problem:
         return Lam, s, M
 
     def miss(self, k, x, v):
-        """By how much the Hamiltonian path of the receding momentum misses v: one midpoint step to the end."""
+        """By how much the Hamiltonian path of the receding momentum misses v: one midpoint step to
+        the end.
+        """
         Lam, s, S = self.forecast(k, x, k)
         t, left, L = self.ts[k], self.ts[-1] - self.ts[k], self.condition.L
         r = v - Lam @ x - s
         momentum = np.linalg.solve(S, r)
 
         def energy(x, p):
-            return np.sum(p * self.process.drift(t, x)) + 0.5 * np.sum(p * (self.process.covariance(t, x) @ p))
+            return np.sum(p * self.process.drift(t, x)) + 0.5 * np.sum(
+                p * (self.process.covariance(t, x) @ p)
+            )
 
         def slopes(x, p):
             dx, h = np.zeros_like(x), 1e-3
@@ -215,7 +227,8 @@ class Problem:
         dp, dx = slopes(x + left / 2 * dx, p - left / 2 * dp)
         x, p = x + left * dx, p - left * dp
         places = [int(np.argmax(row)) for row in L]
-        if np.array_equal(L, np.eye(L.shape[1])[places]) and places == sorted(places):  # points, not combinations
+        # points, not combinations
+        if np.array_equal(L, np.eye(L.shape[1])[places]) and places == sorted(places):
             momentum = L @ p
         noise = 0.0 if self.condition.noise is None else self.condition.noise @ momentum
         miss = v - L @ x - noise
@@ -238,8 +251,14 @@ class Problem:
                 M = np.zeros((len(v), len(v))) if condition.noise is None else condition.noise
             else:
                 Lam, s, M = self.forecast(k + 1, x, k)
-            target = v if last or not self.guide.geodesic else v + self.guide.geodesic * self.miss(k, x, v)
-            mu, cov, B, total = conditional(sigma, m, Lam, s, M, target, exact=last and condition.noise is None)
+            target = (
+                v
+                if last or not self.guide.geodesic
+                else v + self.guide.geodesic * self.miss(k, x, v)
+            )
+            mu, cov, B, total = conditional(
+                sigma, m, Lam, s, M, target, exact=last and condition.noise is None
+            )
             if self.guide.euler and not last:
                 B, cov = np.eye(len(B)), np.eye(len(B))
             if self.guide.learned is not None and not last:
@@ -251,11 +270,16 @@ class Problem:
             if last:
                 log_weight += log_normal(v, Lam @ m + s, total)
                 if condition.noise is not None:
-                    bayes = log_normal(u, zero, one) + log_normal(v, Lam @ x, M) - log_normal(u, mu, cov)
+                    bayes = (
+                        log_normal(u, zero, one)
+                        + log_normal(v, Lam @ x, M)
+                        - log_normal(u, mu, cov)
+                    )
                     np.testing.assert_allclose(bayes, log_normal(v, Lam @ m, total), atol=1e-8)
             else:
                 log_weight += log_normal(u, zero, one) - log_normal(u, mu, cov)
-                if len(sigma) == sigma.shape[1] and np.linalg.cond(sigma) < 1e3:  # the same in state space
+                # the same in state space
+                if len(sigma) == sigma.shape[1] and np.linalg.cond(sigma) < 1e3:
                     p = log_normal(x, m, sigma @ sigma.T)
                     q = log_normal(x, m + sigma @ mu, sigma @ cov @ sigma.T)
                     ratio = log_normal(u, zero, one) - log_normal(u, mu, cov)
@@ -264,7 +288,9 @@ class Problem:
 
 
 def conditional(sigma, m, Lam, s, M, v, exact=False):
-    """The law N(μ, cov) of u ~ N(0, I) given v ~ N(Λ(m + σu) + s, M), a root B of cov, and the covariance of v."""
+    """The law N(μ, cov) of u ~ N(0, I) given v ~ N(Λ(m + σu) + s, M), a root B of cov, and the
+    covariance of v.
+    """
     A = Lam @ sigma
     total = M + A @ A.T
     gain = np.linalg.solve(total, A).T
@@ -285,7 +311,8 @@ def columns(x):
 def check_bridge(bridge, problem: Problem, key, *, inverse=True, compiled=False, atol=1e-10):
     """Path, log weight and inverse of a bridge against the dense replay.
 
-    Not `compiled`, operation by operation: on a few steps that is several times faster than compiling.
+    Not `compiled`, operation by operation: on a few steps that is several times faster than
+    compiling.
     """
     key_noise, key_free = jr.split(key)
     z = jr.normal(key_noise, bridge.noise_shape)
@@ -315,11 +342,14 @@ def columns_of_path(path) -> Any:
     return path[..., None] if path.ndim == 2 else path
 
 
-def killed_and_ended(file, *arguments, progress: Callable[[], int], num_kills: int, within: float) -> list[int]:
-    """Runs a script, kills it by SIGKILL each time at a random moment after it made progress, then lets it end.
+def killed_and_ended(
+    file, *arguments, progress: Callable[[], int], num_kills: int, within: float
+) -> list[int]:
+    """Runs a script, kills it by SIGKILL each time at a random moment after it made progress, then
+    lets it end.
 
-    `progress()`: of what it has written, 0 at first. `within`: seconds after new progress. Returns the progress at each
-    kill.
+    `progress()`: of what it has written, 0 at first. `within`: seconds after new progress. Returns
+    the progress at each kill.
     """
     seed = random.SystemRandom().randrange(2**31)
     print(f"seed {seed}")
@@ -331,7 +361,9 @@ def killed_and_ended(file, *arguments, progress: Callable[[], int], num_kills: i
     }
 
     def start():
-        return subprocess.Popen([sys.executable, file, *map(str, arguments)], env=os.environ | settings)
+        return subprocess.Popen(
+            [sys.executable, file, *map(str, arguments)], env=os.environ | settings
+        )
 
     for _ in range(num_kills):
         process = start()

@@ -1,4 +1,6 @@
-"""Every kind of SDE twice: an SDE of the package, and its process in plain NumPy (`helpers.Process`)."""
+"""Every kind of SDE twice: an SDE of the package, and its process in plain NumPy
+(`helpers.Process`).
+"""
 
 import jax.numpy as jnp
 import lineax as lx
@@ -36,7 +38,9 @@ def diagonal_noise(xp):
 
 
 def tall_noise(xp):
-    return lambda t, x: xp.asarray(R) * (1 + 0.3 * xp.sin(x[:1])) + 0.1 * xp.asarray(R)[::-1] * xp.cos(x[1:2])
+    return lambda t, x: (
+        xp.asarray(R) * (1 + 0.3 * xp.sin(x[:1])) + 0.1 * xp.asarray(R)[::-1] * xp.cos(x[1:2])
+    )
 
 
 def wide_noise(xp):
@@ -76,7 +80,9 @@ def gaussian(x, y, scale):
 
 
 def kunita(noise, factor, covariance=None, space=None, x0=CURVE):
-    flow = nb.KunitaFlow(space or nb.Landmarks(3, 2, weights=W), nb.GaussianKernel(0.3, 0.7), noise=noise)
+    flow = nb.KunitaFlow(
+        space or nb.Landmarks(3, 2, weights=W), nb.GaussianKernel(0.3, 0.7), noise=noise
+    )
     return flow, Process(lambda t, x: np.zeros_like(x), lambda t, x: factor(x)), x0
 
 
@@ -88,7 +94,10 @@ def landmark_factor(x):
 def spectral_factor(x, period=6.0, num_modes=1):
     """(cos ω·x, sin ω·x) √(2 q̂(ω)/P²) over half the lattice, q̂ = α² (2πℓ²)² exp(−ℓ²|ω|²)."""
     half = [
-        (a, b) for a in range(-num_modes, num_modes + 1) for b in range(-num_modes, num_modes + 1) if (a, b) > (0, 0)
+        (a, b)
+        for a in range(-num_modes, num_modes + 1)
+        for b in range(-num_modes, num_modes + 1)
+        if (a, b) > (0, 0)
     ]
     q = lambda w: 0.3**2 * (2 * np.pi * 0.7**2) ** 2 * np.exp(-(0.7**2) * np.sum(w**2)) / period**2  # noqa: E731
     waves = [2 * np.pi / period * np.array(w) for w in half]
@@ -110,11 +119,19 @@ def fourier_factor(x, q=32):
 
 
 def brownian(Q):
-    return nb.BrownianMotion(Q), linear_process(0.0, np.linalg.cholesky(as_matrix(Q, 3)), 0.0, 3, exact=False), X3
+    return (
+        nb.BrownianMotion(Q),
+        linear_process(0.0, np.linalg.cholesky(as_matrix(Q, 3)), 0.0, 3, exact=False),
+        X3,
+    )
 
 
 def linear(B, sigma, beta, x0=X3):
-    return nb.LinearSDE(B, sigma, beta), linear_process(B, sigma, beta, len(x0), columns(x0).shape[1]), x0
+    return (
+        nb.LinearSDE(B, sigma, beta),
+        linear_process(B, sigma, beta, len(x0), columns(x0).shape[1]),
+        x0,
+    )
 
 
 CONSTANT = {
@@ -143,6 +160,8 @@ CURVED = {
     "kunita-landmark": lambda: kunita("landmark", landmark_factor),
     "kunita-spectral": lambda: kunita(nb.SpectralNoise(1, period=6.0), spectral_factor),
     "kunita-grid": lambda: kunita(nb.GridNoise(-2.0, 2.0, 3), grid_factor),
-    "kunita-fourier": lambda: kunita(nb.SpectralNoise(1, period=6.0), fourier_factor, space=nb.FourierBasis(1, 2)),
+    "kunita-fourier": lambda: kunita(
+        nb.SpectralNoise(1, period=6.0), fourier_factor, space=nb.FourierBasis(1, 2)
+    ),
 }
 SDES = CONSTANT | CURVED

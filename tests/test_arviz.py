@@ -43,7 +43,9 @@ def two_sites(data):
     mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
     end = numpyro.sample("end", dist.LogNormal(0.0, 0.1))
     sde = nb.LinearSDE(-1.0, 0.6, mean)
-    wing = nb.DiffusionEndpoint(sde, np.zeros((2, 1)), nb.InexactMatch(0.1), t1=1.0, num_steps=STEPS)
+    wing = nb.DiffusionEndpoint(
+        sde, np.zeros((2, 1)), nb.InexactMatch(0.1), t1=1.0, num_steps=STEPS
+    )
     with numpyro.plate("specimens", 3):
         nb.sample("wing", wing, obs=data)
     leg = nb.DiffusionEndpoint(sde, np.zeros(2), nb.InexactMatch(0.1), t1=end, num_steps=STEPS + 1)
@@ -55,13 +57,27 @@ WINGS = np.linspace(-1, 1, 6).reshape(3, 2, 1)
 
 
 def made_up_run(kernel, samples=None, args=(WINGS,), **fields):
-    """A run, of `two_sites` or another model, with draws that nothing had to compile, 2 chains of 7."""
+    """A run, of `two_sites` or another model, with draws that nothing had to compile, 2 chains of
+    7.
+    """
     rng = np.random.default_rng(1)
     if samples is None:
-        shapes = {"mean": (), "end": (), "wing_noise": (3, STEPS, 2, 1), "leg_noise": (STEPS + 1, 2, 1)}
+        shapes = {
+            "mean": (),
+            "end": (),
+            "wing_noise": (3, STEPS, 2, 1),
+            "leg_noise": (STEPS + 1, 2, 1),
+        }
         samples = {name: rng.normal(size=(2, 7, *shape)) for name, shape in shapes.items()}
         samples["end"] = np.exp(0.1 * samples["end"])
-    mcmc = MCMC(kernel, num_warmup=0, num_samples=7, num_chains=2, chain_method="sequential", progress_bar=False)
+    mcmc = MCMC(
+        kernel,
+        num_warmup=0,
+        num_samples=7,
+        num_chains=2,
+        chain_method="sequential",
+        progress_bar=False,
+    )
     mcmc._states, mcmc._args, mcmc._kwargs = {"z": samples, **fields}, args, {}
     return mcmc
 
@@ -69,7 +85,12 @@ def made_up_run(kernel, samples=None, args=(WINGS,), **fields):
 @pytest.fixture(scope="module")
 def mcmc():
     mcmc = MCMC(
-        NUTS(model), num_warmup=100, num_samples=DRAWS, num_chains=2, chain_method="sequential", progress_bar=False
+        NUTS(model),
+        num_warmup=100,
+        num_samples=DRAWS,
+        num_chains=2,
+        chain_method="sequential",
+        progress_bar=False,
     )
     mcmc.run(jr.key(0), DATA, extra_fields=nb.infer.fields(mcmc.sampler))
     return mcmc
@@ -78,13 +99,21 @@ def mcmc():
 @pytest.fixture(scope="module")
 def data(mcmc):
     """With what `Predictive` returns; made up, which compiles nothing."""
-    prior = {"mean": np.zeros(7), "wing": np.zeros((7, N, 2)), "wing_noise": np.zeros((7, N, STEPS, 2, 1))}
-    return nb.to_arviz(mcmc, prior=prior, posterior_predictive={"wing": np.zeros((2 * DRAWS, N, 2))}, paths=PATHS)
+    prior = {
+        "mean": np.zeros(7),
+        "wing": np.zeros((7, N, 2)),
+        "wing_noise": np.zeros((7, N, STEPS, 2, 1)),
+    }
+    return nb.to_arviz(
+        mcmc, prior=prior, posterior_predictive={"wing": np.zeros((2 * DRAWS, N, 2))}, paths=PATHS
+    )
 
 
 def test_posterior_is_without_the_noise(mcmc, data):
     assert set(data.posterior.data_vars) == {"mean", "twice"}
-    np.testing.assert_array_equal(data.posterior["mean"], mcmc.get_samples(group_by_chain=True)["mean"])
+    np.testing.assert_array_equal(
+        data.posterior["mean"], mcmc.get_samples(group_by_chain=True)["mean"]
+    )
     assert len(arviz.summary(data)) == 2
     kept = nb.to_arviz(mcmc, noise=True).posterior["wing_noise"]
     assert kept.shape == (2, DRAWS, N, STEPS, 2, 1) and kept.dims[2] == "specimens"
@@ -99,7 +128,9 @@ def test_log_likelihood_is_pointwise(mcmc, data):
 
 
 def test_leave_one_out(data):
-    """Against the closed form: the predictive density of a datum given the others, from a grid over the mean."""
+    """Against the closed form: the predictive density of a datum given the others, from a grid over
+    the mean.
+    """
     grid = np.linspace(-4, 6, 2001)
     end = (1 - np.exp(-1)) * grid
     variance = 0.36 * (1 - np.exp(-2)) / 2 + 0.1
@@ -149,13 +180,19 @@ def test_paths_are_those_of_the_bridges(mcmc, data):
         return nb.GuidedBridge(sde, seen, x0=np.zeros(2), t1=1.0, num_steps=STEPS).path(noise)
 
     for chain, draw, i in [(0, 0, 0), (1, 333, 3), (0, 999, 5)]:
-        expected = path(samples["mean"][chain, draw], samples["wing_noise"][chain, draw, i], DATA[i])
-        np.testing.assert_allclose(paths.sel(chain=chain, draw=draw, specimens=i), expected, rtol=1e-12)
+        expected = path(
+            samples["mean"][chain, draw], samples["wing_noise"][chain, draw, i], DATA[i]
+        )
+        np.testing.assert_allclose(
+            paths.sel(chain=chain, draw=draw, specimens=i), expected, rtol=1e-12
+        )
 
 
 def test_netcdf(data, tmp_path):
     data.to_netcdf(str(tmp_path / "run.nc"), engine="h5netcdf")
-    with xarray.open_dataset(tmp_path / "run.nc", group="posterior_paths", engine="h5netcdf") as read:
+    with xarray.open_dataset(
+        tmp_path / "run.nc", group="posterior_paths", engine="h5netcdf"
+    ) as read:
         xarray.testing.assert_equal(read["wing"].load(), data["posterior_paths"]["wing"])
 
 
@@ -163,15 +200,29 @@ def test_netcdf(data, tmp_path):
 def several():
     coords = {"specimens": ["a", "b", "c"], "draw": np.arange(10, 17)}
     kernel = Gibbs([(nb.infer.PCN(two_sites), nb.infer.noise_sites), (NUTS(two_sites), None)])
-    fields = {name: np.full((2, 7), name.startswith("block_states.1.")) for name in nb.infer.fields(kernel)[-1:]}
+    fields = {
+        name: np.full((2, 7), name.startswith("block_states.1."))
+        for name in nb.infer.fields(kernel)[-1:]
+    }
     return nb.to_arviz(made_up_run(kernel, **fields), paths=100, coords=coords)
 
 
 def test_paths_of_several_sites(several):
     paths = several["posterior_paths"]
-    assert paths["wing"].dims == ("chain", "draw", "specimens", "wing_time", "point", "wing_coordinate")
+    assert paths["wing"].dims == (
+        "chain",
+        "draw",
+        "specimens",
+        "wing_time",
+        "point",
+        "wing_coordinate",
+    )
     assert paths["leg"].dims == ("chain", "draw", "leg_time", "leg_coordinate")
-    assert list(paths["draw"]) == list(range(10, 17)) and list(paths["specimens"]) == ["a", "b", "c"]
+    assert list(paths["draw"]) == list(range(10, 17)) and list(paths["specimens"]) == [
+        "a",
+        "b",
+        "c",
+    ]
     np.testing.assert_allclose(paths["wing_time"], [0, 0.5, 1])
     np.testing.assert_array_equal(paths["leg_times"][..., -1], several.posterior["end"])
     assert np.all(paths["leg"][:, :, 0] == 0) and np.all(np.abs(paths["leg"][:, :, -1]) < 2)
@@ -192,16 +243,24 @@ def test_without_noise(several):
     assert set(found.data_vars) == {"leg", "size"}
     np.testing.assert_allclose(found["size"], dist.Normal(samples["mean"], 1.0).log_prob(0.3))
     np.testing.assert_allclose(found["leg"], several.log_likelihood["leg"], rtol=1e-12)
-    with pytest.raises(ValueError, match=r"has not kept \['wing_noise'\]. Run it without \['~z.wing_noise'\]"):
+    with pytest.raises(
+        ValueError, match=r"has not kept \['wing_noise'\]. Run it without \['~z.wing_noise'\]"
+    ):
         nb.to_arviz(mcmc, paths=2)
 
 
 def test_paths_that_cannot_be():
     def no_bridge(data):
-        numpyro.sample("size", dist.Normal(numpyro.sample("mean", dist.Normal()), 1.0).expand(data.shape), obs=data)
+        numpyro.sample(
+            "size",
+            dist.Normal(numpyro.sample("mean", dist.Normal()), 1.0).expand(data.shape),
+            obs=data,
+        )
 
     mcmc = made_up_run(NUTS(no_bridge), {"mean": np.zeros((2, 7))})
-    with pytest.raises(ValueError, match=r"`paths` needs an observed `DiffusionEndpoint` or .*; .* \['size'\]"):
+    with pytest.raises(
+        ValueError, match=r"`paths` needs an observed `DiffusionEndpoint` or .*; .* \['size'\]"
+    ):
         nb.to_arviz(mcmc, paths=2)
     with pytest.raises(ValueError, match="`paths` must be a positive integer; got 0"):
         nb.to_arviz(mcmc, paths=0)
@@ -216,16 +275,32 @@ def kernels():
         (nb.infer.CorrelatedPseudoMarginal(two_sites, 2), (*fields, "step_size")),
         (
             Gibbs([(pcn, nb.infer.noise_sites), (NUTS(two_sites), None)]),
-            ("diverging", *(f"pcn_{f}" for f in fields), *(f"nuts_{f}" for f in (*hmc, "tree_depth"))),
+            (
+                "diverging",
+                *(f"pcn_{f}" for f in fields),
+                *(f"nuts_{f}" for f in (*hmc, "tree_depth")),
+            ),
         ),
         (
-            Gibbs([(pcn, ["wing_noise"]), (pcn, ["leg_noise"]), (nb.infer.FunctionSpaceHMC(two_sites), None)]),
-            ("diverging", *(f"pcn{i}_{f}" for i in (0, 1) for f in fields), *(f"functionspacehmc_{f}" for f in hmc)),
+            Gibbs(
+                [
+                    (pcn, ["wing_noise"]),
+                    (pcn, ["leg_noise"]),
+                    (nb.infer.FunctionSpaceHMC(two_sites), None),
+                ]
+            ),
+            (
+                "diverging",
+                *(f"pcn{i}_{f}" for i in (0, 1) for f in fields),
+                *(f"functionspacehmc_{f}" for f in hmc),
+            ),
         ),
     ]
 
 
-@pytest.mark.parametrize("kernel, names", kernels(), ids=["hmc", "function_space", "pseudo_marginal", "gibbs", "three"])
+@pytest.mark.parametrize(
+    "kernel, names", kernels(), ids=["hmc", "function_space", "pseudo_marginal", "gibbs", "three"]
+)
 def test_statistics_of_every_kernel(kernel, names):
     fields = nb.infer.fields(kernel)
     values = {name: np.arange(1.0, 15.0).reshape(2, 7) for name in fields}
@@ -234,10 +309,14 @@ def test_statistics_of_every_kernel(kernel, names):
     stats = statistics(values, kernel)
     assert set(stats) == set(names)
     assert np.sum(stats["diverging"]) == len(flags)
-    np.testing.assert_array_equal(next(stats[name] for name in stats if name.endswith("lp"))[0, 0], -1.0)
+    np.testing.assert_array_equal(
+        next(stats[name] for name in stats if name.endswith("lp"))[0, 0], -1.0
+    )
 
 
-@pytest.mark.parametrize("kernel", [kernel for kernel, _ in kernels()[:4]], ids=lambda kernel: type(kernel).__name__)
+@pytest.mark.parametrize(
+    "kernel", [kernel for kernel, _ in kernels()[:4]], ids=lambda kernel: type(kernel).__name__
+)
 def test_fields_are_in_the_states(kernel):
     fields = nb.infer.fields(kernel)
     state = jax.eval_shape(lambda key: kernel.init(key, 5, None, (WINGS,), {}), jr.key(0))
@@ -245,7 +324,9 @@ def test_fields_are_in_the_states(kernel):
 
 
 def test_samplers_without_a_model():
-    mcmc = MCMC(NUTS(potential_fn=lambda z: 0.5 * z**2), num_warmup=2, num_samples=2, progress_bar=False)
+    mcmc = MCMC(
+        NUTS(potential_fn=lambda z: 0.5 * z**2), num_warmup=2, num_samples=2, progress_bar=False
+    )
     with pytest.raises(ValueError, match="must run a NumPyro model"):
         nb.to_arviz(mcmc)
 
@@ -259,7 +340,9 @@ SIZES = np.arange(6).reshape(3, 2)
 
 
 def masked_model():
-    """Everything that may carry a mask: a bridge, an ordinary site, one of whole vectors, `obs_mask`."""
+    """Everything that may carry a mask: a bridge, an ordinary site, one of whole vectors,
+    `obs_mask`.
+    """
     mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
     sde = nb.LinearSDE(-1.0, 0.6, mean)
     law = nb.DiffusionEndpoint(sde, np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=STEPS)
@@ -275,7 +358,11 @@ def masked_model():
         with handlers.mask(mask=False):
             numpyro.sample("never", dist.Normal(mean, 1.0), obs=SIZES)
     with numpyro.plate("row", 3):
-        fine = dist.Normal(mean, 1.0).expand([3, 2]).mask(KEEP & [[True, False], [False, False], [True, True]])
+        fine = (
+            dist.Normal(mean, 1.0)
+            .expand([3, 2])
+            .mask(KEEP & [[True, False], [False, False], [True, True]])
+        )
         numpyro.sample("pair", fine.to_event(1), obs=SIZES)
 
 
@@ -284,17 +371,36 @@ def masked():
     rng = np.random.default_rng(3)
     shapes = {"mean": (), "wing_noise": (3, 2, STEPS, 2, 1), "tail_unobserved": (3, 2)}
     samples = {name: rng.normal(size=(2, 40, *shape)) for name, shape in shapes.items()}
-    return samples, nb.to_arviz(made_up_run(NUTS(masked_model), samples, ()), coords={"sides": ["left", "right"]})
+    return samples, nb.to_arviz(
+        made_up_run(NUTS(masked_model), samples, ()), coords={"sides": ["left", "right"]}
+    )
 
 
 def test_masked_data_are_no_data(masked):
     samples, data = masked
     mean = samples["mean"][..., None, None]
-    assert set(data.log_likelihood.data_vars) == {"wing", "spots", "size", "tail_observed", "sometimes", "pair"}
+    assert set(data.log_likelihood.data_vars) == {
+        "wing",
+        "spots",
+        "size",
+        "tail_observed",
+        "sometimes",
+        "pair",
+    }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        counts = {name: arviz.loo(data, var_name=name).n_data_points for name in data.log_likelihood.data_vars}
-    assert counts == {"wing": 5, "spots": 5, "size": 6, "tail_observed": 5, "sometimes": 6, "pair": 2}
+        counts = {
+            name: arviz.loo(data, var_name=name).n_data_points
+            for name in data.log_likelihood.data_vars
+        }
+    assert counts == {
+        "wing": 5,
+        "spots": 5,
+        "size": 6,
+        "tail_observed": 5,
+        "sometimes": 6,
+        "pair": 2,
+    }
     normal = dist.Normal(mean, 1.0).log_prob(SIZES)
     expected = {
         "spots": dist.Poisson(np.exp(mean)).log_prob(SIZES)[..., KEEP],
@@ -313,7 +419,9 @@ def test_masked_data_are_no_data(masked):
 
     for place, (i, j) in {0: (0, 0), 2: (1, 0), 4: (2, 1)}.items():
         value = wing(samples["mean"][1, 3], samples["wing_noise"][1, 3, i, j], PAIRS[i, j])
-        assert float(data.log_likelihood["wing"][1, 3, place]) == pytest.approx(float(value), abs=1e-10)
+        assert float(data.log_likelihood["wing"][1, 3, place]) == pytest.approx(
+            float(value), abs=1e-10
+        )
         assert data.log_likelihood["wing_specimens"][place] == i
         assert data.log_likelihood["wing_sides"][place] == ["left", "right"][j]
 
@@ -342,11 +450,16 @@ def plain_run():
 
 
 @pytest.mark.parametrize(
-    "draws, found", [((14,), (2, 7)), ((2, 7), (2, 7)), ((5,), (1, 5)), ((2, 3), (2, 3)), ((1, 7), (1, 7))]
+    "draws, found",
+    [((14,), (2, 7)), ((2, 7), (2, 7)), ((5,), (1, 5)), ((2, 3), (2, 3)), ((1, 7), (1, 7))],
 )
 def test_predictions_of_some_draws(draws, found):
     made_up = np.arange(np.prod(draws) * 6.0).reshape(*draws, 3, 2)
-    warning = warnings.catch_warnings() if found == (2, 7) else pytest.warns(UserWarning, match="holds draws")
+    warning = (
+        warnings.catch_warnings()
+        if found == (2, 7)
+        else pytest.warns(UserWarning, match="holds draws")
+    )
     with warning:
         data = nb.to_arviz(plain_run(), posterior_predictive={"size": made_up, "other": made_up})
     assert data.posterior_predictive["size"].shape == (*found, 3, 2)
@@ -356,7 +469,9 @@ def test_predictions_of_some_draws(draws, found):
 
 def test_predictions_that_are_not_of_the_same_draws():
     draws = {"size": np.zeros((14, 3, 2)), "mean": np.zeros(5)}
-    with pytest.raises(ValueError, match=r"same draws of every site; got leading axes \[\(5,\), \(14,\)\]"):
+    with pytest.raises(
+        ValueError, match=r"same draws of every site; got leading axes \[\(5,\), \(14,\)\]"
+    ):
         nb.to_arviz(plain_run(), posterior_predictive=draws)
 
 
@@ -378,8 +493,15 @@ def test_names_with_a_slash(tmp_path, several):
         assert data[group]["moth.wing"].dims[-3:] == ("moth.specimens", "moth.point", "xy")
     assert set(data.posterior.data_vars) == {"moth.mean", "moth.end"}
     assert list(data.log_likelihood["moth.specimens"].values) == ["a", "b", "c"]
-    assert data["posterior_paths"]["moth.leg"].dims == ("chain", "draw", "moth.leg_time", "moth.leg_coordinate")
-    np.testing.assert_allclose(data.log_likelihood["moth.wing"], several.log_likelihood["wing"], rtol=1e-12)
+    assert data["posterior_paths"]["moth.leg"].dims == (
+        "chain",
+        "draw",
+        "moth.leg_time",
+        "moth.leg_coordinate",
+    )
+    np.testing.assert_allclose(
+        data.log_likelihood["moth.wing"], several.log_likelihood["wing"], rtol=1e-12
+    )
     data.to_netcdf(str(tmp_path / "scoped.nc"), engine="h5netcdf")
     with xarray.open_dataset(tmp_path / "scoped.nc", group="posterior", engine="h5netcdf") as read:
         np.testing.assert_array_equal(read["moth.mean"], samples["mean"])

@@ -4,15 +4,16 @@ Each row of the table is a call that is right, and what its arguments are. One a
 replaced by
 
 - an *impostor*, what no conversion may make a value of that kind (text, dates, booleans or complex
-  numbers for a number, a class for its instance, an integer for a key): `ValueError` or `TypeError`,
-  with the argument's name;
+  numbers for a number, a class for its instance, an integer for a key): `ValueError` or
+  `TypeError`, with the argument's name;
 - the same value in other *clothes* (lists, numbers of NumPy and JAX, columns of pandas): the same
   result;
-- an *odd* number (of another shape or none, negative, NaN, infinite, huge): an error with the argument's
-  name, or the result of the same number in plain lists, where NaN must be seen in the result.
+- an *odd* number (of another shape or none, negative, NaN, infinite, huge): an error with the
+  argument's name, or the result of the same number in plain lists, where NaN must be seen in the
+  result.
 
-A row for a new callable, and a kind for a new argument, are asked for by the first test. The draws are
-the same in every run; `--bad-inputs N` draws N others.
+A row for a new callable, and a kind for a new argument, are asked for by the first test. The draws
+are the same in every run; `--bad-inputs N` draws N others.
 """
 
 import contextlib
@@ -148,7 +149,8 @@ ARE_TOO = {"sde": {"linear"}, "linear": {"sde"}}
 class Row:
     """A call that is right, the kinds of its arguments, and which part of the result is compared.
 
-    A question mark behind a kind allows None. Rows that are `costly` are tried with impostors alone.
+    A question mark behind a kind allows None. Rows that are `costly` are tried with impostors
+    alone.
     """
 
     call: Callable
@@ -160,7 +162,9 @@ class Row:
 
 
 def row(call, costly=False, result=lambda found: found, names=None, /, **arguments) -> Row:
-    """Arguments as (kind, value), or as a kind alone, whose default is not replaced in the right call."""
+    """Arguments as (kind, value), or as a kind alone, whose default is not replaced in the right
+    call.
+    """
     right = {name: a[1] for name, a in arguments.items() if isinstance(a, tuple)}
     kinds = {name: a[0] if isinstance(a, tuple) else a for name, a in arguments.items()}
     return Row(call, right, kinds, result, costly, names or {})
@@ -286,9 +290,13 @@ def table() -> dict[str, Row]:
             sample="function?",
             spread=("number", 0.5),
         ),
-        "StudentMatch": row(nb.StudentMatch, variance=("number", 0.5), degrees_of_freedom=("number", 4.0)),
+        "StudentMatch": row(
+            nb.StudentMatch, variance=("number", 0.5), degrees_of_freedom=("number", 4.0)
+        ),
         "HuberMatch": row(nb.HuberMatch, variance=("number", 0.5), threshold=("number", 1.0)),
-        "ProcrustesMatch": row(nb.ProcrustesMatch, variance=("number", 0.5), up_to=("name", "rigid")),
+        "ProcrustesMatch": row(
+            nb.ProcrustesMatch, variance=("number", 0.5), up_to=("name", "rigid")
+        ),
         "CurrentMatch": row(
             nb.CurrentMatch,
             variance=("number", 0.5),
@@ -320,8 +328,12 @@ def table() -> dict[str, Row]:
         ),
         # guides and bridges
         "FrozenGuide": row(nb.FrozenGuide, auxiliary="linear?", rounds=("count from 0", 1)),
-        "RecedingGuide": row(nb.RecedingGuide, end_weight=("number", 0.5), rounds=("count from 0", 1)),
-        "GeodesicGuide": row(nb.GeodesicGuide, correction=("number", 0.5), end_weight=("number", 0.5)),
+        "RecedingGuide": row(
+            nb.RecedingGuide, end_weight=("number", 0.5), rounds=("count from 0", 1)
+        ),
+        "GeodesicGuide": row(
+            nb.GeodesicGuide, correction=("number", 0.5), end_weight=("number", 0.5)
+        ),
         "DriftGuide": row(nb.DriftGuide, guide=("guide", nb.FrozenGuide())),
         "ScoreGuide": row(
             nb.ScoreGuide,
@@ -383,7 +395,9 @@ def table() -> dict[str, Row]:
         "Tree.num_steps": row(TREE.num_steps, longest=("setting", 0.5), multiple=("count", 2)),
         "Tree.divided": row(TREE.divided, pieces=("array", np.array([1.0, 2.0, 1.0, 3.0]))),
         "Tree.clade": row(
-            lambda names, stem=True: TREE.clade(*(names if isinstance(names, list) else [names]), stem=stem),
+            lambda names, stem=True: TREE.clade(
+                *(names if isinstance(names, list) else [names]), stem=stem
+            ),
             names=("names", ["a", "b"]),
             stem=("flag", True),
         ),
@@ -409,7 +423,12 @@ def table() -> dict[str, Row]:
             batch_size=("count?", 1),
         ),
         "estimate_tree_evidence": row(
-            nb.estimate_tree_evidence, True, law=("law", LAW), data=("array", X), key=("key", KEY), settings="free"
+            nb.estimate_tree_evidence,
+            True,
+            law=("law", LAW),
+            data=("array", X),
+            key=("key", KEY),
+            settings="free",
         ),
         "estimate_model_evidence": row(
             nb.estimate_model_evidence,
@@ -1249,7 +1268,9 @@ def as_numbers(x):
 
 
 def outcome(entry: Row, arguments: dict):
-    """The numbers of the result, or the error; anything but a `ValueError` or a `TypeError` is raised."""
+    """The numbers of the result, or the error; anything but a `ValueError` or a `TypeError` is
+    raised.
+    """
     with tiny_programs():
         try:
             return leaves(entry.result(entry.call(**arguments)))

@@ -1,4 +1,6 @@
-"""Probabilities of boxes: against products of normals, a multivariate normal, quadrature, and simulated ends."""
+"""Probabilities of boxes: against products of normals, a multivariate normal, quadrature, and
+simulated ends.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +38,9 @@ def run(sde, box, x0, num_steps, count, t1=1.0, seed=0):
 def estimate(log_weights):
     """Log of the mean weight and its standard error; the tail of the weights is light."""
     assert nb.weights.pareto_k(log_weights) < 0.7
-    return float(nb.weights.log_mean_exp(log_weights)), float(nb.weights.standard_error(log_weights))
+    return float(nb.weights.log_mean_exp(log_weights)), float(
+        nb.weights.standard_error(log_weights)
+    )
 
 
 def log_interval(low, high, mean, sd):
@@ -118,7 +122,10 @@ def test_correlated_linear_process():
     sigma, dt = np.array([[0.5, 0.0], [0.3, 0.4]]), 1 / num_steps
     mean, S = x0, np.zeros((2, 2))
     for _ in range(num_steps):
-        mean, S = mean + dt * B @ mean, (np.eye(2) + dt * B) @ S @ (np.eye(2) + dt * B).T + dt * sigma @ sigma.T
+        mean, S = (
+            mean + dt * B @ mean,
+            (np.eye(2) + dt * B) @ S @ (np.eye(2) + dt * B).T + dt * sigma @ sigma.T,
+        )
     lower, upper = np.array([-0.5, -0.6]), np.array([0.1, 0.0])
     truth = np.log(multivariate_normal(mean, S).cdf(upper, lower_limit=lower))
     sde = nb.SDE(lambda t, x, args: jnp.asarray(B) @ x, lambda t, x, args: sigma)
@@ -131,7 +138,9 @@ def test_correlated_linear_process():
 
 
 def test_probability_of_1e_12():
-    """Value and derivatives in closed form: an interval 7 SD away, and a half-line on the other side."""
+    """Value and derivatives in closed form: an interval 7 SD away, and a half-line on the other
+    side.
+    """
 
     @jax.jit
     @jax.value_and_grad
@@ -139,11 +148,15 @@ def test_probability_of_1e_12():
         x0, low, high = arguments
         infinity = jnp.array(INF)
         box = nb.CylinderSet(jnp.stack([low, -infinity]), jnp.stack([high, -high]))
-        bridge = nb.GuidedBridge(nb.BrownianMotion(1.0), box, x0=jnp.stack([x0, 0.0 * x0]), ts=np.linspace(0, 1, 3))
+        bridge = nb.GuidedBridge(
+            nb.BrownianMotion(1.0), box, x0=jnp.stack([x0, 0.0 * x0]), ts=np.linspace(0, 1, 3)
+        )
         return bridge.log_weight(0.7 * jnp.ones((3, 2, 1)))
 
     low, high = 3.7, 4.1
-    value, (d_x0, d_low, d_high) = log_probability((jnp.array(-3.3), jnp.array(low), jnp.array(high)))
+    value, (d_x0, d_low, d_high) = log_probability(
+        (jnp.array(-3.3), jnp.array(low), jnp.array(high))
+    )
     a, b = low + 3.3, high + 3.3
     first = ndtr(-a) - ndtr(-b)
     assert 1e-13 < first < 1.3e-12
@@ -156,7 +169,9 @@ def test_probability_of_1e_12():
 
 @pytest.mark.slow
 def test_probability_of_1e_12_of_correlated_coordinates():
-    """P(X > 5.2, Y > 5.5) at correlation 0.6, and its derivative with respect to the start, by quadrature."""
+    """P(X > 5.2, Y > 5.5) at correlation 0.6, and its derivative with respect to the start, by
+    quadrature.
+    """
     rho, a, b = 0.6, 5.8, 6.2
     R = np.array([[1.0, rho], [rho, 1.0]])
 
@@ -175,7 +190,9 @@ def test_probability_of_1e_12_of_correlated_coordinates():
         def log_weight(shift, z):
             box = nb.CylinderSet(np.array([a, b]), np.array([INF, INF]))
             x0 = shift * jnp.ones(2)
-            return nb.GuidedBridge(nb.BrownianMotion(R), box, x0=x0, ts=np.linspace(0, 1, 3)).log_weight(z)
+            return nb.GuidedBridge(
+                nb.BrownianMotion(R), box, x0=x0, ts=np.linspace(0, 1, 3)
+            ).log_weight(z)
 
         return jax.vmap(jax.value_and_grad(log_weight), in_axes=(None, 0))(jnp.zeros(()), z)
 
@@ -242,7 +259,9 @@ def nonlinear(lower, upper, z):
     ids=["interval", "half-lines", "point and half-line", "free and point"],
 )
 def test_nonlinear_process(lower, upper, last_but_one):
-    """The last step of a simulated path is averaged over in closed form, so that points have a density."""
+    """The last step of a simulated path is averaged over in closed form, so that points have a
+    density.
+    """
     lower, upper, dt = np.array(lower), np.array(upper), 1 / STEPS
     x = last_but_one
     mean, sd = x + dt * drift(np, x), np.sqrt(dt) * noise(np, x)
@@ -251,7 +270,9 @@ def test_nonlinear_process(lower, upper, last_but_one):
     if np.all(np.isinf([lower[0], upper[0]])):  # known to be free, it is left out
         log_weights = run(NONLINEAR, nb.CylinderSet(lower, upper), X0, STEPS, count=20_000)
     else:
-        ends, log_weights = (np.asarray(x) for x in nonlinear(lower, upper, jr.normal(jr.key(0), (20_000, 11, 2, 1))))
+        ends, log_weights = (
+            np.asarray(x) for x in nonlinear(lower, upper, jr.normal(jr.key(0), (20_000, 11, 2, 1)))
+        )
         assert np.all((ends >= lower - 1e-12) & (ends <= upper + 1e-12))
     found, error = estimate(log_weights)
     assert error < 0.01 and own < 0.01
@@ -278,7 +299,9 @@ def test_kunita_flow(n, num_steps, count, simulations):
     alpha, length, s = 0.3, 0.5, 2 * np.pi * np.arange(n) / n
     x0 = np.stack([np.cos(s), np.sin(s)], 1)
     lower, upper = x0 - np.array([0.35, 0.25]), x0 + np.array([0.3, 0.4])
-    ends = np.concatenate([kunita_ends(x0, alpha, length, num_steps, simulations // 10 + i) for i in range(10)])
+    ends = np.concatenate(
+        [kunita_ends(x0, alpha, length, num_steps, simulations // 10 + i) for i in range(10)]
+    )
     p = np.mean(np.all((ends >= lower) & (ends <= upper), axis=(1, 2)))
     own = np.sqrt((1 - p) / (p * len(ends)))
     flow = nb.KunitaFlow(nb.Landmarks(n, 2), nb.GaussianKernel(alpha, length))

@@ -1,4 +1,6 @@
-"""Functions that a user writes: what they read, what they capture, when they are called, and what they return."""
+"""Functions that a user writes: what they read, what they capture, when they are called, and what
+they return.
+"""
 
 import functools
 import pickle
@@ -119,13 +121,16 @@ def counted(monkeypatch):
 
 @pytest.mark.parametrize("door", [weight, log_prob])
 def test_a_function_is_what_it_is_when_the_bridge_is_made(door, counted):
-    """Each value that it reads gives its own density, and functions that compute the same share their program."""
+    """Each value that it reads gives its own density, and functions that compute the same share
+    their program.
+    """
     for reader in READERS if door is weight else READERS[-2:]:
         drift, change = reader()
         for rate in (1.0, 3.0, 1.0):
             change(rate)
             np.testing.assert_allclose(door(drift), truth(rate), rtol=0, atol=1e-10)
-    assert counted[0] <= 4  # two rates as numbers, one program for the array, once more where it is a law's
+    # two rates as numbers, one program for the array, once more where it is a law's
+    assert counted[0] <= 4
 
 
 def test_a_bridge_keeps_what_it_was_made_of():
@@ -136,14 +141,18 @@ def test_a_bridge_keeps_what_it_was_made_of():
         sde = nb.SDE(drift, diffusion)
         change(3.0)
         np.testing.assert_allclose(made.log_weight(NOISE), truth(1.0), rtol=0, atol=1e-10)
-        np.testing.assert_allclose(made.with_guide(nb.RecedingGuide()).log_weight(NOISE), truth(1.0), atol=1e-10)
+        np.testing.assert_allclose(
+            made.with_guide(nb.RecedingGuide()).log_weight(NOISE), truth(1.0), atol=1e-10
+        )
         assert sde.drift(0.0, jnp.ones(1)) == -3.0
         with pytest.raises(ValueError, match="`bridges` must have one estimand"):
             nb.compare({"a": made, "b": bridge(drift)}, jax.random.key(0), num_particles=2)
 
 
 def test_no_call_compiles_again(counted):
-    """Nor a new function of the same text, captured arrays of other values, or a guide of the same kind."""
+    """Nor a new function of the same text, captured arrays of other values, or a guide of the same
+    kind.
+    """
     for value in (1.0, 2.0, 3.0):
         rate = np.full(1, value)
         made = bridge(lambda t, x, args, rate=rate: -rate * jax.nn.relu(x))
@@ -187,7 +196,10 @@ def test_exact_constants_tell_programs_apart():
     """To the last bit, and by their types."""
     x = jnp.arange(3.0)
     constants = [0.1, np.nextafter(0.1, 1), 0.0, -0.0, np.nan, np.float32(0.1), 1e300]
-    programs = [close(lambda t, x, c=c: jnp.where(x > c, x, c).astype(float), 0.0, x).program for c in constants]
+    programs = [
+        close(lambda t, x, c=c: jnp.where(x > c, x, c).astype(float), 0.0, x).program
+        for c in constants
+    ]
     assert len(set(programs)) == len(constants)
     matrices = [np.eye(3), 2 * np.eye(3)]
     first, second = (close(lambda t, x, A=A: jnp.asarray(A) @ x, 0.0, x) for A in matrices)
@@ -210,7 +222,8 @@ def test_captured_tracers_are_parameters():
     np.testing.assert_allclose(slope, (truth(1.5 + h) - truth(1.5 - h)) / (2 * h), atol=1e-8)
     found = jax.vmap(captured)(jnp.array([0.5, 1.5]))
     np.testing.assert_allclose(found, [truth(0.5), truth(1.5)], atol=1e-10)
-    made = jax.vmap(lambda rate: bridge(lambda t, x, args: -rate * x))(jnp.array([0.5, 1.5]))  # a batch of bridges
+    # a batch of bridges
+    made = jax.vmap(lambda rate: bridge(lambda t, x, args: -rate * x))(jnp.array([0.5, 1.5]))
     found = jax.vmap(lambda b: b.log_weight(NOISE))(made)
     np.testing.assert_allclose(found, [truth(0.5), truth(1.5)], atol=1e-10)
 
@@ -265,7 +278,11 @@ FUNCTIONS = {
 def test_a_closed_sde_is_the_sde(name, dtype):
     f, x, t = FUNCTIONS[name], X3.astype(dtype), jnp.asarray(0.4, dtype)
     constant = name in ("number", "numpy")
-    sde = nb.SDE(lambda t, x, args: -x if constant else (f(t, x, args) if "operator" not in name else x), f, ARGS)
+    sde = nb.SDE(
+        lambda t, x, args: -x if constant else (f(t, x, args) if "operator" not in name else x),
+        f,
+        ARGS,
+    )
     closed = sde.closed(t, x)
     values = [(s.drift(t, x), *s.noise(t, x)) for s in (closed, sde)]
     for found, right in zip(*values, strict=True):
@@ -307,7 +324,9 @@ def test_pickles():
 def test_a_value_that_has_escaped_is_refused_with_the_cure(use, transform):
     rates = jnp.ones(3) if transform is jax.vmap else jnp.ones(())
     sde = transform(lambda rate: nb.SDE(lambda t, x, args: -rate * x, diffusion))(rates)
-    with pytest.raises(ValueError, match="`drift` captured a value of a traced.*`args`.*`equinox.Module`"):
+    with pytest.raises(
+        ValueError, match="`drift` captured a value of a traced.*`args`.*`equinox.Module`"
+    ):
         if use == "bridge":
             nb.GuidedBridge(sde, MATCH.at([0.2]), x0=X0, t1=1.0, num_steps=3)
         elif use == "law":
@@ -321,7 +340,9 @@ def test_a_value_that_has_escaped_is_refused_with_the_cure(use, transform):
 def test_a_batch_of_sdes():
     """Parameters in `args`, and what the functions capture shared."""
     scale = np.full((1, 1), 1.0)
-    sdes = jax.vmap(lambda rate: nb.SDE(lambda t, x, args: -args * (scale @ x), diffusion, rate))(jnp.array([1.0, 3.0]))
+    sdes = jax.vmap(lambda rate: nb.SDE(lambda t, x, args: -args * (scale @ x), diffusion, rate))(
+        jnp.array([1.0, 3.0])
+    )
     law = nb.DiffusionEndpoint(sdes, X0, MATCH, t1=1.0, num_steps=STEPS, batch_shape=(2,))
     found = law.given(jnp.broadcast_to(NOISE, (2, *NOISE.shape))).log_prob(jnp.full((2, 1), DATUM))
     np.testing.assert_allclose(found, [truth(1.0), truth(3.0)], atol=1e-10)
@@ -333,13 +354,17 @@ def test_a_batch_of_sdes():
 def guide(network, context=None):
     one = jnp.ones(())
     size = 0 if context is None else 1
-    standard = Standard(one, one, jnp.zeros((1, 1)), jnp.ones((1, 1)), jnp.zeros(size), jnp.ones(size))
+    standard = Standard(
+        one, one, jnp.zeros((1, 1)), jnp.ones((1, 1)), jnp.zeros(size), jnp.ones(size)
+    )
     standard = eqx.tree_at(lambda s: s.scale, standard, jnp.ones((1, 1)))
     return nb.ScoreGuide(nb.FrozenGuide(), network, standard, context)
 
 
 def test_networks_and_contexts_are_read_anew():
-    """A learned guide that adds c to the score moves the path by what c is now, through a bridge and through a law."""
+    """A learned guide that adds c to the score moves the path by what c is now, through a bridge
+    and through a law.
+    """
     settings = {"c": 1.0}
     by_network = guide(lambda t, x, v, theta: settings["c"] * jnp.ones_like(x))
     by_context = guide(
@@ -350,7 +375,9 @@ def test_networks_and_contexts_are_read_anew():
         return bridge(linear, guide=guide).log_weight(NOISE)
 
     def of_law(guide):
-        law = nb.DiffusionEndpoint(nb.SDE(linear, diffusion), X0, MATCH, t1=1.0, num_steps=STEPS, guide=guide)
+        law = nb.DiffusionEndpoint(
+            nb.SDE(linear, diffusion), X0, MATCH, t1=1.0, num_steps=STEPS, guide=guide
+        )
         return law.given(NOISE).log_prob(jnp.array([DATUM]))
 
     for door in (of_bridge, of_law):
@@ -363,7 +390,9 @@ def test_networks_and_contexts_are_read_anew():
 
 
 def test_scores_to_compare_with_are_read_anew():
-    """E ∫ |c s|² / ∫ |s|² of the score (1 + c) s is c² / (1 + c)² where the guide's is s: a closed form."""
+    """E ∫ |c s|² / ∫ |s|² of the score (1 + c) s is c² / (1 + c)² where the guide's is s: a closed
+    form.
+    """
     made, settings = bridge(linear), {"c": 0.0}
 
     def score(t, x):
@@ -407,7 +436,9 @@ def test_no_function_is_called_outside_the_interval():
     for t in grid[:-1]:
         mean, variance = mean * (1 - dt / t), variance * (1 - dt / t) ** 2 + dt * 2 * 0.25 / t**2
     right = scipy.stats.norm(mean, np.sqrt(variance + VARIANCE)).logpdf(DATUM)
-    np.testing.assert_allclose(law.given(np.zeros((STEPS, 2, 1))).log_prob(jnp.array([DATUM])), right, atol=1e-10)
+    np.testing.assert_allclose(
+        law.given(np.zeros((STEPS, 2, 1))).log_prob(jnp.array([DATUM])), right, atol=1e-10
+    )
 
 
 # What a function returns.
@@ -418,15 +449,30 @@ WRONG = [
     ("complex", lambda t, x, a: x * 1j, None, r"`drift\(t, x, args\)` must be.*complex"),
     ("text", lambda t, x, a: "fast", None, r"`drift\(t, x, args\)`.*got 'fast'"),
     ("boolean", lambda t, x, a: x > 0, None, r"`drift\(t, x, args\)`.*bool"),
-    ("pair", lambda t, x, a: (x, x), None, r"`drift` must return an array shaped like the state, \(3,\); got \(2, 3\)"),
+    (
+        "pair",
+        lambda t, x, a: (x, x),
+        None,
+        r"`drift` must return an array shaped like the state, \(3,\); got \(2, 3\)",
+    ),
     ("scalar", lambda t, x, a: 0.0, None, r"`drift` must return .*\(3,\); got \(\)"),
     ("column", lambda t, x, a: x[:, None], None, r"`drift` must return .*got \(3, 1\)"),
     ("no-noise", ZERO, lambda t, x, a: None, r"`diffusion\(t, x, args\)` must be.*got None"),
     ("complex-noise", ZERO, lambda t, x, a: 1j, r"`diffusion\(t, x, args\)` must be.*real part"),
     ("short-noise", ZERO, lambda t, x, a: x[:2], r"`diffusion` must be .*got \(2,\)"),
     ("no-columns", ZERO, lambda t, x, a: jnp.ones((3, 0)), r"`diffusion` must be .*got \(3, 0\)"),
-    ("three-axes", ZERO, lambda t, x, a: jnp.ones((3, 1, 1)), r"`diffusion` must return .*got shape \(3, 1, 1\)"),
-    ("operator", ZERO, lambda t, x, a: lx.DiagonalLinearOperator(x[:2]), r"`diffusion` must be .*got \(2,\)"),
+    (
+        "three-axes",
+        ZERO,
+        lambda t, x, a: jnp.ones((3, 1, 1)),
+        r"`diffusion` must return .*got shape \(3, 1, 1\)",
+    ),
+    (
+        "operator",
+        ZERO,
+        lambda t, x, a: lx.DiagonalLinearOperator(x[:2]),
+        r"`diffusion` must be .*got \(2,\)",
+    ),
 ]
 
 
@@ -458,6 +504,10 @@ def test_wrong_spaces_are_refused(name):
             make(wrong)
     for wrong in (nb.Landmarks(4, 2), nb.Landmarks(3, 1), nb.FourierBasis(2, 2)):
         assert make(wrong).space is wrong
-        with pytest.raises(ValueError, match=r"`x0`, a state of this `space`, must have shape .*got \(3, 2\)"):
-            nb.GuidedBridge(make(wrong), MATCH.at(np.ones((3, 2))), x0=np.ones((3, 2)), t1=1.0, num_steps=2)
+        with pytest.raises(
+            ValueError, match=r"`x0`, a state of this `space`, must have shape .*got \(3, 2\)"
+        ):
+            nb.GuidedBridge(
+                make(wrong), MATCH.at(np.ones((3, 2))), x0=np.ones((3, 2)), t1=1.0, num_steps=2
+            )
     nb.GuidedBridge(make(nb.Landmarks(3, 1)), MATCH.at(X3), x0=X3, t1=1.0, num_steps=2)

@@ -57,8 +57,18 @@ POOR = EXACT.with_guide(nb.FrozenGuide(nb.BrownianMotion(1e-3)))
 
 @pytest.fixture(scope="module")
 def found():
-    bridges = {"exact": EXACT, "receding": EXACT.with_guide(nb.RecedingGuide()), "brownian": BROWNIAN}
-    return nb.compare(bridges, jr.key(3), num_particles=2500, score=exact_score, training_seconds={"brownian": 7.0})
+    bridges = {
+        "exact": EXACT,
+        "receding": EXACT.with_guide(nb.RecedingGuide()),
+        "brownian": BROWNIAN,
+    }
+    return nb.compare(
+        bridges,
+        jr.key(3),
+        num_particles=2500,
+        score=exact_score,
+        training_seconds={"brownian": 7.0},
+    )
 
 
 def test_evidence_is_the_closed_form(found):
@@ -78,17 +88,25 @@ def test_an_exact_guide_has_equal_weights(found):
 def test_verdict_of_agreement(found):
     lines = found.verdict.splitlines()
     assert lines[0] == "exact and receding agree to rounding."
-    assert [line.split(":")[0] for line in lines[1:]] == ["exact and brownian agree", "receding and brownian agree"]
+    assert [line.split(":")[0] for line in lines[1:]] == [
+        "exact and brownian agree",
+        "receding and brownian agree",
+    ]
     assert found.agree("exact", "brownian") and "trusted" not in found.verdict
 
 
 def test_errors_are_independent():
-    """Two bridges that are one differ by their noise, which has the spread of the joint standard error."""
+    """Two bridges that are one differ by their noise, which has the spread of the joint standard
+    error.
+    """
     gaps = []
     for seed in range(40):
         pair = nb.compare({"a": BROWNIAN, "b": BROWNIAN}, jr.key(seed), num_particles=2500)
         a, b = pair.rows.values()
-        gaps.append((a["log_evidence"] - b["log_evidence"]) / math.hypot(a["standard_error"], b["standard_error"]))
+        gaps.append(
+            (a["log_evidence"] - b["log_evidence"])
+            / math.hypot(a["standard_error"], b["standard_error"])
+        )
     # the sum of squares is chi-squared with 40 degrees of freedom, but for one failure in 1000
     low, high = scipy.stats.chi2(40).ppf([0.0005, 0.9995])
     assert low < np.sum(np.square(gaps)) < high
@@ -131,8 +149,12 @@ def test_score_error_is_an_integral_over_the_conditioned_process():
         offset = brownian_score(t, mean) - exact_score(t, mean)
         slope = after**2 / (S_after + VARIANCE) - 1 / (SIGMA**2 * (T - t) + VARIANCE)
         error += dt * np.sum(offset**2 + slope**2 * variance)
-        size += dt * np.sum(exact_score(t, mean) ** 2 + (after**2 / (S_after + VARIANCE)) ** 2 * variance)
-    ratios = [float(_score_error(uneven, exact_score, jr.split(jr.key(seed), 64))) for seed in range(60)]
+        size += dt * np.sum(
+            exact_score(t, mean) ** 2 + (after**2 / (S_after + VARIANCE)) ** 2 * variance
+        )
+    ratios = [
+        float(_score_error(uneven, exact_score, jr.split(jr.key(seed), 64))) for seed in range(60)
+    ]
     standard_error = np.std(ratios) / math.sqrt(len(ratios))
     assert standard_error < 0.02 * error / size
     assert abs(np.mean(ratios) - error / size) < 3 * standard_error
@@ -179,18 +201,50 @@ EQUAL = row(1.0, 0.0, ess=20.0)
 PAIRS = [
     ("near", row(1.0, 0.1), row(1.4, 0.1), True, "agree: they differ by 0.4, or 2.8 joint"),
     ("far", row(1.0, 0.1), row(1.5, 0.1), False, "do not agree: they differ by 0.5, or 3.5"),
-    ("untrusted", row(1.0, 0.1), row(1.0, 0.1, doubt="why"), None, "cannot .*Not .*: second \\(why\\)"),
-    ("few", row(1.0, 0.1), row(1.0, 0.1, ess=99.4), None, "too few draws .* ESS of 99 of second, and 100"),
-    ("far-and-few", row(1.0, 0.1, ess=5.0), row(9.0, 0.1), None, "too few draws .* ESS of 5 of first"),
-    ("blurred", row(1.0, 0.3), row(1.0, 0.3), None, "too few draws .* 3 joint standard errors are 1.3 nats"),
+    (
+        "untrusted",
+        row(1.0, 0.1),
+        row(1.0, 0.1, doubt="why"),
+        None,
+        "cannot .*Not .*: second \\(why\\)",
+    ),
+    (
+        "few",
+        row(1.0, 0.1),
+        row(1.0, 0.1, ess=99.4),
+        None,
+        "too few draws .* ESS of 99 of second, and 100",
+    ),
+    (
+        "far-and-few",
+        row(1.0, 0.1, ess=5.0),
+        row(9.0, 0.1),
+        None,
+        "too few draws .* ESS of 5 of first",
+    ),
+    (
+        "blurred",
+        row(1.0, 0.3),
+        row(1.0, 0.3),
+        None,
+        "too few draws .* 3 joint standard errors are 1.3 nats",
+    ),
     ("rounding", EQUAL, row(1.0 + 1e-12, 0.0, ess=20.0), True, "agree to rounding"),
-    ("beyond-rounding", EQUAL, row(1.0 + 1e-11, 0.0, ess=20.0), False, "do not agree: they differ by 1e-11"),
+    (
+        "beyond-rounding",
+        EQUAL,
+        row(1.0 + 1e-11, 0.0, ess=20.0),
+        False,
+        "do not agree: they differ by 1e-11",
+    ),
     ("one-equal", EQUAL, row(1.1, 0.1), True, "agree: "),
     ("one-equal-few", EQUAL, row(1.0, 0.1, ess=20.0), None, "too few draws .* ESS of 20 of second"),
 ]
 
 
-@pytest.mark.parametrize(("first", "second", "agree", "said"), [pytest.param(*c, id=n) for n, *c in PAIRS])
+@pytest.mark.parametrize(
+    ("first", "second", "agree", "said"), [pytest.param(*c, id=n) for n, *c in PAIRS]
+)
 def test_what_can_be_said_of_two(first, second, agree, said):
     """Symmetric, and never an agreement of what is not known."""
     found = nb.Comparison(20, {"first": first, "second": second})
@@ -206,7 +260,13 @@ def test_a_quick_run_says_that_it_is_one():
 def test_one_particle_is_not_trusted():
     found = nb.compare({"exact": EXACT, "brownian": BROWNIAN}, jr.key(0), num_particles=1)
     for row in found.rows.values():
-        hidden = ("standard_error", "ess", "ess_fraction", "pareto_k", "seconds_per_effective_sample")
+        hidden = (
+            "standard_error",
+            "ess",
+            "ess_fraction",
+            "pareto_k",
+            "seconds_per_effective_sample",
+        )
         assert all(math.isnan(row[name]) for name in hidden) and not row["trusted"]
     assert not found.agree("exact", "brownian") and not found.agree("exact", "exact")
     assert "exact and brownian cannot be compared" in found.verdict
@@ -218,12 +278,18 @@ def test_one_particle_is_not_trusted():
 def test_failed_weights_are_seen(monkeypatch, weight, shown):
     """A NaN in one step of one guide; and weights that are all zero."""
     right = DriftSteering.drive
-    monkeypatch.setattr(DriftSteering, "drive", lambda self, z: (right(self, z)[0], z.sum() * 0 + weight))
+    monkeypatch.setattr(
+        DriftSteering, "drive", lambda self, z: (right(self, z)[0], z.sum() * 0 + weight)
+    )
     fresh = bridge(num_steps=7 if np.isnan(weight) else 8)
     bridges = {"right": fresh, "failed": fresh.with_guide(nb.DriftGuide(nb.FrozenGuide()))}
     found = nb.compare(bridges, jr.key(0), num_particles=50)
     row = found.rows["failed"]
-    assert str(row["log_evidence"]) == shown and not row["trusted"] and not found.agree("right", "failed")
+    assert (
+        str(row["log_evidence"]) == shown
+        and not row["trusted"]
+        and not found.agree("right", "failed")
+    )
     assert not math.isfinite(row["seconds_per_effective_sample"])
     assert "right and failed cannot be compared" in found.verdict
     assert f"Not to be trusted: failed (the log evidence is {shown})" in found.verdict
@@ -240,18 +306,27 @@ class TrainedGuide(nb.AbstractGuide):
 
 def test_training_time(found):
     row = found.rows["brownian"]
-    assert row["seconds"] > 0 and row["training_seconds"] == 7.0 and found.rows["exact"]["training_seconds"] == 0.0
+    assert (
+        row["seconds"] > 0
+        and row["training_seconds"] == 7.0
+        and found.rows["exact"]["training_seconds"] == 0.0
+    )
     assert row["seconds_per_effective_sample"] == pytest.approx(row["seconds"] / row["ess"])
-    assert row["seconds_per_effective_sample_with_training"] == pytest.approx((row["seconds"] + 7.0) / row["ess"])
+    assert row["seconds_per_effective_sample_with_training"] == pytest.approx(
+        (row["seconds"] + 7.0) / row["ess"]
+    )
     learned = EXACT.with_guide(TrainedGuide({"seconds": np.array([1.0, 2.5])}))
-    assert nb.compare({"a": learned}, jr.key(0), num_particles=20).rows["a"]["training_seconds"] == 2.5
+    assert (
+        nb.compare({"a": learned}, jr.key(0), num_particles=20).rows["a"]["training_seconds"] == 2.5
+    )
     given = nb.compare({"a": learned}, jr.key(0), num_particles=20, training_seconds={"a": 9.0})
     assert given.rows["a"]["training_seconds"] == 9.0
 
 
 def test_batches_change_nothing_but_the_time():
     whole, parts = (
-        nb.compare({"a": BROWNIAN}, jr.key(1), num_particles=50, batch_size=size).rows["a"] for size in (None, 16)
+        nb.compare({"a": BROWNIAN}, jr.key(1), num_particles=50, batch_size=size).rows["a"]
+        for size in (None, 16)
     )
     for name in ("log_evidence", "standard_error", "ess", "pareto_k"):
         assert whole[name] == pytest.approx(parts[name], rel=1e-10)
@@ -265,7 +340,9 @@ def test_table(found):
     assert "score error" in lines[0] and "k̂ must be below 0.70" in lines[4]
     assert str(found).endswith(found.verdict)
     alone = nb.compare({"a": BROWNIAN}, jr.key(0), num_particles=20)
-    assert "score error" not in str(alone) and alone.verdict.startswith("a: nothing to compare it with.")
+    assert "score error" not in str(alone) and alone.verdict.startswith(
+        "a: nothing to compare it with."
+    )
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -301,7 +378,9 @@ def test_plot(found, tmp_path):
     (low, high) = evidence.containers[2].lines[2][0].get_segments()[0][:, 0]
     assert (high - low) == pytest.approx(4 * row["standard_error"])
     assert [text.get_text() for text in evidence.texts] == ["not to be trusted"]
-    assert [bar.get_width() for bar in ess.patches[:3]] == [100 * row["ess_fraction"] for row in found.rows.values()]
+    assert [bar.get_width() for bar in ess.patches[:3]] == [
+        100 * row["ess_fraction"] for row in found.rows.values()
+    ]
     assert ess.texts[3].get_text() == "nan" and ess.patches[3].get_width() == 0.0
     assert seconds.patches[2].get_width() == row["seconds_per_effective_sample_with_training"]
     assert seconds.patches[6].get_width() == row["seconds_per_effective_sample"]
@@ -312,9 +391,21 @@ def pair(**kwargs):
 
 
 REFUSED = [
-    ("sde", pair(sde=nb.LinearSDE(-RATE, 0.7, SHIFT)), r"`bridges` .*one estimand; 'b' has another `sde` than 'a'"),
-    ("sde-class", pair(sde=nb.BrownianMotion(1.0)), "another `sde` than 'a': BrownianMotion, not LinearSDE"),
-    ("condition", pair(condition=nb.InexactMatch(0.1).at(V)), "'b' has another `condition`.*`bridge.with_guide"),
+    (
+        "sde",
+        pair(sde=nb.LinearSDE(-RATE, 0.7, SHIFT)),
+        r"`bridges` .*one estimand; 'b' has another `sde` than 'a'",
+    ),
+    (
+        "sde-class",
+        pair(sde=nb.BrownianMotion(1.0)),
+        "another `sde` than 'a': BrownianMotion, not LinearSDE",
+    ),
+    (
+        "condition",
+        pair(condition=nb.InexactMatch(0.1).at(V)),
+        "'b' has another `condition`.*`bridge.with_guide",
+    ),
     ("datum", pair(condition=nb.InexactMatch(VARIANCE).at(V + 1)), "'b' has another `condition`"),
     ("start", pair(x0=X0 + 1), "'b' has another `x0` than 'a'"),
     ("grid", pair(num_steps=20), r"another `ts` than 'a': shape \(21,\), not \(11,\)"),
@@ -324,16 +415,32 @@ REFUSED = [
         pair(guide=nb.FrozenGuide(), solver=diffrax.Euler()),
         "another `solver` than 'a': Euler, not GuidedStep",
     ),
-    ("nothing", lambda: nb.compare({}, jr.key(0)), "`bridges` must be a dictionary of bridges by name.*got {}"),
+    (
+        "nothing",
+        lambda: nb.compare({}, jr.key(0)),
+        "`bridges` must be a dictionary of bridges by name.*got {}",
+    ),
     ("list", lambda: nb.compare([EXACT], jr.key(0)), "`bridges` must be a dictionary"),  # type: ignore
-    ("number", lambda: nb.compare({"a": 3}, jr.key(0)), r"`bridges\['a'\]` must be a `GuidedBridge`; got 3"),
+    (
+        "number",
+        lambda: nb.compare({"a": 3}, jr.key(0)),
+        r"`bridges\['a'\]` must be a `GuidedBridge`; got 3",
+    ),
     (
         "training-of-another",
         lambda: nb.compare({"a": EXACT}, jr.key(0), training_seconds={"c": 1.0}),
         r"`training_seconds` must be of the bridges \['a'\]; got \['c'\]",
     ),
-    ("no-particle", lambda: nb.compare({"a": EXACT}, jr.key(0), num_particles=0), "`num_particles` must be .*got 0"),
-    ("no-batch", lambda: nb.compare({"a": EXACT}, jr.key(0), batch_size=0), "`batch_size` must be .*got 0"),
+    (
+        "no-particle",
+        lambda: nb.compare({"a": EXACT}, jr.key(0), num_particles=0),
+        "`num_particles` must be .*got 0",
+    ),
+    (
+        "no-batch",
+        lambda: nb.compare({"a": EXACT}, jr.key(0), batch_size=0),
+        "`batch_size` must be .*got 0",
+    ),
     (
         "score-number",
         lambda: nb.compare({"a": EXACT}, jr.key(0), num_particles=5, score=3),
@@ -347,14 +454,20 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("make", "message"), [pytest.param(*case, id=name) for name, *case in REFUSED])
+@pytest.mark.parametrize(
+    ("make", "message"), [pytest.param(*case, id=name) for name, *case in REFUSED]
+)
 def test_refused(make, message):
     with pytest.raises(ValueError, match=f"(?s){message}"):
         make()
 
 
 def test_one_solver_for_all():
-    """The continuous weight on one grid has one expectation, whatever the auxiliary process; biased at fixed dt."""
+    """The continuous weight on one grid has one expectation, whatever the auxiliary process; biased
+    at fixed dt.
+    """
     euler = bridge(nb.FrozenGuide(), num_steps=40, solver=diffrax.Euler())
-    found = nb.compare({"a": euler, "b": euler.with_guide(BROWNIAN.guide)}, jr.key(0), num_particles=500)
+    found = nb.compare(
+        {"a": euler, "b": euler.with_guide(BROWNIAN.guide)}, jr.key(0), num_particles=500
+    )
     assert found.agree("a", "b") and jax.tree.leaves(found.rows)

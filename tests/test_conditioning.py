@@ -1,4 +1,6 @@
-"""Matches, conditions and messages against SciPy's normal laws and dense conditioning; normal tails by quadrature."""
+"""Matches, conditions and messages against SciPy's normal laws and dense conditioning; normal tails
+by quadrature.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,11 @@ from models import CURVE, Q, W
 
 import numpyro_bridges as nb
 from numpyro_bridges.conditioning import GaussianMessage, log_interval_probability
-from numpyro_bridges.conditioning._normal import log_ndtri, truncated_quantile, truncated_quantile_inverse
+from numpyro_bridges.conditioning._normal import (
+    log_ndtri,
+    truncated_quantile,
+    truncated_quantile_inverse,
+)
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
@@ -41,11 +47,23 @@ MATCHES = {
     "mask": (nb.InexactMatch(0.05, mask=SEEN), EYE[SEEN], 0.05 * np.eye(2)),
     "mask-vector": (nb.InexactMatch([0.1, 0.2, 0.3], mask=SEEN), EYE[SEEN], np.diag([0.1, 0.3])),
     "weights": (nb.InexactMatch(0.05, space=WEIGHTED), EYE, np.diag(0.05 / W)),
-    "weights-vector": (nb.InexactMatch([0.1, 0.2, 0.3], space=WEIGHTED), EYE, np.diag([0.1, 0.2, 0.3] / W)),
+    "weights-vector": (
+        nb.InexactMatch([0.1, 0.2, 0.3], space=WEIGHTED),
+        EYE,
+        np.diag([0.1, 0.2, 0.3] / W),
+    ),
     "weights-matrix": (nb.InexactMatch(Q, space=WEIGHTED), EYE, Q / np.sqrt(np.outer(W, W))),
-    "weights-picked": (nb.InexactMatch(0.05, PICK, space=WEIGHTED), PICK, np.diag(0.05 / W[[2, 0]])),
+    "weights-picked": (
+        nb.InexactMatch(0.05, PICK, space=WEIGHTED),
+        PICK,
+        np.diag(0.05 / W[[2, 0]]),
+    ),
     "weights-operator": (nb.InexactMatch(0.05, PAIR, space=WEIGHTED), PAIR, 0.05 * np.eye(2)),
-    "weights-mask": (nb.InexactMatch(0.05, mask=SEEN, space=WEIGHTED), EYE[SEEN], np.diag(0.05 / W[SEEN])),
+    "weights-mask": (
+        nb.InexactMatch(0.05, mask=SEEN, space=WEIGHTED),
+        EYE[SEEN],
+        np.diag(0.05 / W[SEEN]),
+    ),
     "point-sd": (nb.InexactMatch.from_point_sd(0.2, WEIGHTED), EYE, np.diag(0.04 * W.mean() / W)),
 }
 
@@ -66,12 +84,15 @@ def message(match, sde, v, x):
 
 @pytest.mark.parametrize("name", MATCHES)
 def test_inexact_match(name):
-    """Its density, score and kernel, and the nearest state that meets it; the space of the match or of the SDE."""
+    """Its density, score and kernel, and the nearest state that meets it; the space of the match or
+    of the SDE.
+    """
     match, L, noise = MATCHES[name]
     x, v = CURVE, L @ VALUE
     law = scipy.stats.multivariate_normal(np.zeros(len(noise)), noise)
     truth = sum(law.logpdf((v - L @ x)[:, c]) for c in (0, 1))
-    kernel = truth + np.linalg.slogdet(2 * np.pi * noise)[1]  # two columns of half a log determinant each
+    # two columns of half a log determinant each
+    kernel = truth + np.linalg.slogdet(2 * np.pi * noise)[1]
     mesh = nb.LinearSDE(-0.5, 0.4, space=match.space)
     operator = None if match.operator.ndim == 0 else match.operator
     bare = nb.InexactMatch(match.variance, operator, mask=match.mask)
@@ -122,7 +143,9 @@ def test_exact_match():
         reference = np.asarray(condition.reference(sde, x))
         close(reference, CURVE + np.linalg.pinv(L) @ (L @ VALUE - L @ CURVE))
         mean, S = L @ CURVE + 0.1, L @ Q @ L.T
-        truth = sum(scipy.stats.multivariate_normal(mean[:, c], S).logpdf((L @ VALUE)[:, c]) for c in (0, 1))
+        truth = sum(
+            scipy.stats.multivariate_normal(mean[:, c], S).logpdf((L @ VALUE)[:, c]) for c in (0, 1)
+        )
         close(condition.log_value(jnp.asarray(mean), jnp.asarray(np.linalg.cholesky(S))), truth)
 
 
@@ -137,24 +160,38 @@ def test_a_masked_row_leaves_no_trace():
     truth = scipy.stats.norm.logpdf(VALUE[SEEN], CURVE[SEEN], np.sqrt(0.05)).sum()
     for hidden in (0.0, 1e6, np.nan):
         close(log_h(SEEN, np.where(SEEN[:, None], VALUE, hidden)), truth)
-    close(log_h(np.ones(3, bool), VALUE), scipy.stats.norm.logpdf(VALUE, CURVE, np.sqrt(0.05)).sum())
+    close(
+        log_h(np.ones(3, bool), VALUE), scipy.stats.norm.logpdf(VALUE, CURVE, np.sqrt(0.05)).sum()
+    )
     close(log_h(np.zeros(3, bool), VALUE), 0.0)
 
 
 def test_the_h_norm_does_not_depend_on_the_mesh():
-    """Brownian motion of curves, T = 1: log E exp(−‖X_1 − v‖²/2σ) by a dense determinant, at reference values."""
+    """Brownian motion of curves, T = 1: log E exp(−‖X_1 − v‖²/2σ) by a dense determinant, at
+    reference values.
+    """
     alpha, ell, variance = 0.2, 0.5, 0.01
     for n, value in ((8, -5.714164), (16, -5.716044)):
         s = 2 * np.pi * np.arange(n) / n
         x0 = np.stack([np.cos(s), np.sin(s)], 1)
         v = np.stack([1.3 * np.cos(s) + 0.1 + 0.05 * np.cos(3 * s), 0.8 * np.sin(s) - 0.2], 1)
-        K = alpha**2 * np.pi * ell**2 * np.exp(-np.sum((x0[:, None] - x0[None]) ** 2, -1) / (4 * ell**2))
+        K = (
+            alpha**2
+            * np.pi
+            * ell**2
+            * np.exp(-np.sum((x0[:, None] - x0[None]) ** 2, -1) / (4 * ell**2))
+        )
         total = np.eye(n) + K / n / variance
-        truth = -np.linalg.slogdet(total)[1] - 0.5 * np.sum((v - x0) * np.linalg.solve(total.T, v - x0)) / n / variance
+        truth = (
+            -np.linalg.slogdet(total)[1]
+            - 0.5 * np.sum((v - x0) * np.linalg.solve(total.T, v - x0)) / n / variance
+        )
         match = nb.InexactMatch(variance, space=nb.Landmarks(n, 2), normalised=False)
 
         def log_h(x0, match=match, K=K, v=v):
-            return nb.GuidedBridge(nb.BrownianMotion(K), match.at(v), x0=x0, t1=1.0, num_steps=1).log_h(0.0, x0)
+            return nb.GuidedBridge(
+                nb.BrownianMotion(K), match.at(v), x0=x0, t1=1.0, num_steps=1
+            ).log_h(0.0, x0)
 
         found = jax.jit(log_h)(x0)
         close(found, truth, 1e-8)
@@ -164,17 +201,26 @@ def test_the_h_norm_does_not_depend_on_the_mesh():
 # Messages.
 
 
-@pytest.mark.parametrize("operator", [1.3, np.array([0.5, -0.2, 1.1]), PAIR], ids=["scalar", "diagonal", "matrix"])
+@pytest.mark.parametrize(
+    "operator", [1.3, np.array([0.5, -0.2, 1.1]), PAIR], ids=["scalar", "diagonal", "matrix"]
+)
 def test_a_message_is_bayes_rule(operator, key):
-    """Prior N(m, S) and message: the posterior from H, F, c and the evidence are those of the dense joint Gaussian."""
+    """Prior N(m, S) and message: the posterior from H, F, c and the evidence are those of the dense
+    joint Gaussian.
+    """
     m = 2 if np.ndim(operator) == 2 else 3
     L, x = as_matrix(operator, 3), np.asarray(jr.normal(key, (3, 2)))
     factor = np.linalg.cholesky(Q[:m, :m]) if np.ndim(operator) else 0.7
     P = as_matrix(factor, m)
     shift, v, prior_mean, S = L @ VALUE + 0.1, 0.5 * (L @ CURVE), 0.2 * CURVE, 2 * Q
     h = GaussianMessage(*map(jnp.asarray, (operator, shift, factor, v, 0.3)))
-    log_h, score, (H, F, c) = jax.jit(lambda h, x: (h.log_value(x), h.score(x), h.information(3)))(h, x)
-    truth = 0.3 + sum(scipy.stats.multivariate_normal((L @ x + shift)[:, i], P @ P.T).logpdf(v[:, i]) for i in (0, 1))
+    log_h, score, (H, F, c) = jax.jit(lambda h, x: (h.log_value(x), h.score(x), h.information(3)))(
+        h, x
+    )
+    truth = 0.3 + sum(
+        scipy.stats.multivariate_normal((L @ x + shift)[:, i], P @ P.T).logpdf(v[:, i])
+        for i in (0, 1)
+    )
     close(log_h, truth)
     close(c + np.sum(F * x) - 0.5 * np.sum(x * (H @ x)), truth, 1e-10)
     close(score, F - H @ x, 1e-10)
@@ -189,7 +235,10 @@ def test_a_message_is_bayes_rule(operator, key):
         prior_mean * np.linalg.solve(S, prior_mean)
     )
     log_evidence = c + 0.5 * quadratic - np.linalg.slogdet(S @ precision)[1]
-    dense = sum(scipy.stats.multivariate_normal((L @ prior_mean + shift)[:, i], total).logpdf(v[:, i]) for i in (0, 1))
+    dense = sum(
+        scipy.stats.multivariate_normal((L @ prior_mean + shift)[:, i], total).logpdf(v[:, i])
+        for i in (0, 1)
+    )
     close(log_evidence, 0.3 + dense, 1e-9)
 
 
@@ -201,8 +250,14 @@ MEAN = np.array([0.4, -0.1, 0.3])
 
 
 def test_cylinder_set():
-    """The probability of a box under a dense normal: the mean weight of draws against SciPy's cdf, the SE below 1 %."""
-    box, factor, count = nb.CylinderSet(LOW, HIGH), jnp.asarray(np.linalg.cholesky(COVARIANCE)), 4000
+    """The probability of a box under a dense normal: the mean weight of draws against SciPy's cdf,
+    the SE below 1 %.
+    """
+    box, factor, count = (
+        nb.CylinderSet(LOW, HIGH),
+        jnp.asarray(np.linalg.cholesky(COVARIANCE)),
+        4000,
+    )
     sde, x = nb.LinearSDE(-0.5, 0.4), jnp.asarray(MEAN)
     box.check(sde, x)
     assert box.exact and box.rows == (0, 1, 2) and box.observation(sde, x).factor is None
@@ -220,20 +275,26 @@ def test_cylinder_set():
     close(back, z, 1e-6)
     law = scipy.stats.multivariate_normal(MEAN, COVARIANCE)
     weight = np.exp(log_weight + law.logpdf(value))
-    truth = scipy.stats.multivariate_normal.cdf(HIGH, MEAN, COVARIANCE, abseps=1e-7, releps=1e-7, lower_limit=LOW)
+    truth = scipy.stats.multivariate_normal.cdf(
+        HIGH, MEAN, COVARIANCE, abseps=1e-7, releps=1e-7, lower_limit=LOW
+    )
     error = weight.std() / np.sqrt(count)
     assert error < 0.01 * truth
     assert abs(weight.mean() - truth) < 3.5 * error
 
 
 def test_sets_of_independent_coordinates():
-    """log_value is the sum of log interval probabilities, a log density where pinned; the weight is constant."""
+    """log_value is the sum of log interval probabilities, a log density where pinned; the weight is
+    constant.
+    """
     low, high = np.array([[-0.2, 0.5], [0.3, -np.inf]]), np.array([[0.7, np.inf], [0.3, 0.1]])
     mean, sd = np.array([[0.1, 0.2], [0.0, -0.4]]), np.array([0.5, 0.8])
     box = nb.CylinderSet(low, high)
     p = scipy.stats.norm(mean, sd[:, None])
     pinned = low == high
-    truth = np.where(pinned, p.logpdf(np.where(pinned, low, 0)), np.log(p.cdf(high) - p.cdf(low) + pinned)).sum()
+    truth = np.where(
+        pinned, p.logpdf(np.where(pinned, low, 0)), np.log(p.cdf(high) - p.cdf(low) + pinned)
+    ).sum()
     a, b = (low - mean) / sd[:, None], (high - mean) / sd[:, None]
     z = np.asarray(jr.normal(jr.key(0), (5, 1, 2, 2)))
 
@@ -264,7 +325,9 @@ def test_interval_censored():
     edges = np.concatenate([[-np.inf], cuts, [np.inf]])
     log_value = jax.jit(lambda bins: match.at(bins).log_value(jnp.asarray(mean), jnp.asarray(sd)))
     for bins in ((0, 3), (1, 2), (2, 1), (3, 0)):
-        p = scipy.stats.norm.cdf(edges[np.add(bins, 1)], mean, sd) - scipy.stats.norm.cdf(edges[list(bins)], mean, sd)
+        p = scipy.stats.norm.cdf(edges[np.add(bins, 1)], mean, sd) - scipy.stats.norm.cdf(
+            edges[list(bins)], mean, sd
+        )
         close(log_value(np.array(bins, float)), np.log(p).sum())
         assert match.at(np.array(bins)).rows == (0, 1)
     close(sum(np.exp(log_value(np.array([i, j], float))) for i in range(4) for j in range(4)), 1.0)
@@ -277,7 +340,9 @@ def test_interval_censored():
 
 
 def log_probability(a, b):
-    """log ∫_a^b φ by Gauss–Legendre quadrature of exp(−a t − t²/2), mirrored to a ≥ 0 unless the interval holds 0."""
+    """log ∫_a^b φ by Gauss–Legendre quadrature of exp(−a t − t²/2), mirrored to a ≥ 0 unless the
+    interval holds 0.
+    """
     if b < 0 or (a < 0 and -a > b):
         a, b = -b, -a
     if a < 0:
@@ -317,7 +382,9 @@ def test_empty_interval():
 
 def test_quantile_of_a_logarithm():
     """Against `scipy.special.ndtri_exp`, to log p = −10⁵; the derivative is P/φ."""
-    log_p = np.array([-1e-8, -1e-3, -0.1, -0.6931, -2.0, -4.99, -5.01, -20.0, -700.0, -800.0, -1e4, -1e5])
+    log_p = np.array(
+        [-1e-8, -1e-3, -0.1, -0.6931, -2.0, -4.99, -5.01, -20.0, -700.0, -800.0, -1e4, -1e5]
+    )
     found, slope = jax.jit(jax.vmap(jax.value_and_grad(log_ndtri)))(log_p)
     truth = scipy.special.ndtri_exp(log_p)
     np.testing.assert_allclose(found, truth, rtol=1e-9, atol=1e-9)
@@ -326,7 +393,9 @@ def test_quantile_of_a_logarithm():
 
 @pytest.mark.parametrize("a, b", [*INTERVALS[:11], (-0.5, 40.0)])
 def test_truncated_quantile(a, b):
-    """P(a ≤ w' ≤ w) = Φ(z) P(a ≤ w' ≤ b), by quadrature; monotone, inside, inverted; finite gradients."""
+    """P(a ≤ w' ≤ w) = Φ(z) P(a ≤ w' ≤ b), by quadrature; monotone, inside, inverted; finite
+    gradients.
+    """
     z = np.array([-2.5, -1.0, 0.0, 0.7, 2.0])
     w, slopes, back = map(np.asarray, QUANTILES(z, a, b))
     assert np.all((w >= a) & (w <= b)) and np.all(np.diff(w) > 0)
@@ -335,7 +404,8 @@ def test_truncated_quantile(a, b):
     close(back, z, 1e-6)
     assert np.all(np.isfinite(slopes))
     total = log_probability(a, b)
-    dz = np.exp(scipy.stats.norm.logpdf(z) + total - scipy.stats.norm.logpdf(w))  # φ(w) dw = P φ(z) dz
+    # φ(w) dw = P φ(z) dz
+    dz = np.exp(scipy.stats.norm.logpdf(z) + total - scipy.stats.norm.logpdf(w))
     np.testing.assert_allclose(slopes[0], dz, rtol=1e-5)
 
 
@@ -353,11 +423,15 @@ SCORES = np.array([-2.5, -0.3, 0.0, 1.1, 2.8])
 
 
 def near_end_and_width(s, d):
-    """log of ∫_0^d exp(−s v − v²/2) dv, and that of φ(s); the first by quadrature, or by a difference around 0."""
+    """log of ∫_0^d exp(−s v − v²/2) dv, and that of φ(s); the first by quadrature, or by a
+    difference around 0.
+    """
     width = min(d, 45 / (1 + s)) if s >= 0 else d
     if s < 0 and d > 0.1:
         upper = scipy.special.ndtr(s + d) if np.isfinite(d) else 1.0
-        return np.log(upper - scipy.special.ndtr(s)) - scipy.stats.norm.logpdf(s), scipy.stats.norm.logpdf(s)
+        return np.log(upper - scipy.special.ndtr(s)) - scipy.stats.norm.logpdf(
+            s
+        ), scipy.stats.norm.logpdf(s)
     t, w = np.polynomial.legendre.leggauss(80)
     v, w = width * (1 + t) / 2, width * w / 2
     return np.log(np.sum(w * np.exp(-v * (s + 0.5 * v)))), scipy.stats.norm.logpdf(s)
@@ -365,7 +439,8 @@ def near_end_and_width(s, d):
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_width_by_distance(dtype):
-    """Intervals of every width at every distance, in units of the SD, to either side, in both precisions.
+    """Intervals of every width at every distance, in units of the SD, to either side, in both
+    precisions.
 
     One end is 0 and the mean moves, so that the width keeps its digits however far out: value,
     derivatives by mean and far end, and the noise of a draw.
@@ -390,7 +465,9 @@ def test_width_by_distance(dtype):
 
     answers = found(s, d, side)
     s, d, value, by_mean, by_far_end, draw, back = (np.asarray(a, float) for a in (s, d, *answers))
-    log_integral, log_phi = np.transpose([near_end_and_width(*pair) for pair in zip(s, d, strict=True)])
+    log_integral, log_phi = np.transpose(
+        [near_end_and_width(*pair) for pair in zip(s, d, strict=True)]
+    )
     rtol = {np.float64: 1e-9, np.float32: 3e-4}[dtype]
     np.testing.assert_allclose(value, log_integral + log_phi, rtol=rtol / 100, atol=rtol)
     finite = np.where(np.isinf(d), 1.0, d)
@@ -404,12 +481,16 @@ def test_width_by_distance(dtype):
         [np.exp(near_end_and_width(a, x)[0] - whole) for x in row]
         for a, row, whole in zip(s, draw, log_integral, strict=True)
     ]
-    np.testing.assert_allclose(share, np.broadcast_to(scipy.stats.norm.cdf(SCORES), back.shape), atol=10 * rtol)
+    np.testing.assert_allclose(
+        share, np.broadcast_to(scipy.stats.norm.cdf(SCORES), back.shape), atol=10 * rtol
+    )
 
 
 def test_columns_of_a_vector_condition():
     """A vector state is one column: the same density."""
-    h = message(nb.InexactMatch(0.05), nb.LinearSDE(-0.5, 0.4), VALUE[:, 0], jnp.asarray(CURVE[:, 0]))
+    h = message(
+        nb.InexactMatch(0.05), nb.LinearSDE(-0.5, 0.4), VALUE[:, 0], jnp.asarray(CURVE[:, 0])
+    )
     truth = scipy.stats.norm.logpdf(VALUE[:, 0], CURVE[:, 0], np.sqrt(0.05)).sum()
     close(h.log_value(jnp.asarray(CURVE[:, 0])), truth)
     assert columns(h.score(jnp.asarray(CURVE[:, 0]))).shape == (3, 1)

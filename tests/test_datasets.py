@@ -10,12 +10,17 @@ import pytest
 from numpyro_bridges import datasets
 from numpyro_bridges.shapes import align_start, procrustes_align, rms_radius
 
-needs_ktch = pytest.mark.skipif(importlib.util.find_spec("ktch") is None, reason="ktch is not installed")
+needs_ktch = pytest.mark.skipif(
+    importlib.util.find_spec("ktch") is None, reason="ktch is not installed"
+)
 
 
 def check_in_register(shapes, num_shapes, num_points):
     """Centred, of unit RMS radius, counter-clockwise, rotated onto the mean, which is their own."""
-    assert shapes.points.shape == (num_shapes, num_points, 2) and shapes.mean.shape == (num_points, 2)
+    assert shapes.points.shape == (num_shapes, num_points, 2) and shapes.mean.shape == (
+        num_points,
+        2,
+    )
     assert len(shapes.labels) == len(shapes.names) == len(set(shapes.names)) == num_shapes
     everything = np.concatenate([shapes.points, shapes.mean[None]])
     np.testing.assert_allclose(everything.mean(axis=1), 0.0, atol=1e-12)
@@ -34,7 +39,9 @@ def test_wings(genus, num_shapes):
     wings = datasets.mosquito_wings(num_points=32, genus=genus)
     check_in_register(wings, num_shapes, 32)
     assert genus is None or set(wings.labels) == {genus}
-    assert all(name.startswith(f"{label} ") for name, label in zip(wings.names, wings.labels, strict=True))
+    assert all(
+        name.startswith(f"{label} ") for name, label in zip(wings.names, wings.labels, strict=True)
+    )
     steps = np.linalg.norm(np.roll(wings.points, -1, axis=1) - wings.points, axis=-1)
     assert steps.max() < 1.1 * np.median(steps) and steps.min() > 0.7 * np.median(steps)
 
@@ -53,14 +60,18 @@ def test_wings_start_at_the_hinge_and_lie_along_x():
 def test_wings_by_genus_are_counted_as_the_docstring_says():
     counts = Counter(datasets.mosquito_wings(num_points=3).labels)
     for genus, count in counts.items():
-        plural = {1: "1 each of", 57: f'{count} of genus `"{genus}"`'}.get(count, f'{count} of `"{genus}"`')
+        plural = {1: "1 each of", 57: f'{count} of genus `"{genus}"`'}.get(
+            count, f'{count} of `"{genus}"`'
+        )
         assert plural in " ".join(datasets.mosquito_wings.__doc__.split())
     assert [genus for genus, count in counts.items() if count == 1] == ["TO", "OR", "DE"]
 
 
 @needs_ktch
 def test_unknown_genus_lists_the_known_ones():
-    with pytest.raises(ValueError, match=r"`genus` must be one of 'AE' \(57\), 'CX' \(25\), .*; got 'Culex'"):
+    with pytest.raises(
+        ValueError, match=r"`genus` must be one of 'AE' \(57\), 'CX' \(25\), .*; got 'Culex'"
+    ):
         datasets.mosquito_wings(genus="Culex")
 
 
@@ -78,11 +89,20 @@ def test_without_ktch(monkeypatch):
 
 
 def test_mosquito_tree():
-    """Clades as published, and Grafen's heights: the number of tips below a node, less one, in units of the root's."""
+    """Clades as published, and Grafen's heights: the number of tips below a node, less one, in
+    units of the root's.
+    """
     tree = datasets.mosquito_tree()
     assert set(tree.observed_names) == set("AE AN CA CX DE MA OR PS TO UR WY".split())
-    below = {node: [tip for tip in tree.tips if node in lineage(tree, tip)] for node in range(tree.num_nodes)}
-    clades = {"".join(sorted(tree.names[tip] for tip in tips)) for tips in below.values() if 1 < len(tips) < 11}
+    below = {
+        node: [tip for tip in tree.tips if node in lineage(tree, tip)]
+        for node in range(tree.num_nodes)
+    }
+    clades = {
+        "".join(sorted(tree.names[tip] for tip in tips))
+        for tips in below.values()
+        if 1 < len(tips) < 11
+    }
     deeper = {"AECACXDEMAORPSTOURWY", "AECACXDEMAORPSTOWY", "CACXDEMAORTOWY", "CAMAORTOWY"}
     assert clades == deeper | {"CAMAOR", "CAOR", "TOWY", "CXDE", "AEPS"}
     ages = [(len(below[node]) - 1) / 10 for node in range(tree.num_nodes)]
@@ -102,7 +122,9 @@ def lineage(tree, node):
 
 @needs_ktch
 def test_tips_of_the_tree_are_the_genera_of_the_wings():
-    assert set(datasets.mosquito_wings(num_points=3).labels) == set(datasets.mosquito_tree().observed_names)
+    assert set(datasets.mosquito_wings(num_points=3).labels) == set(
+        datasets.mosquito_tree().observed_names
+    )
 
 
 def test_ellipses():

@@ -28,4 +28,6 @@ def test_two_batched_factorisations_at_once():
     try:
         subprocess.run([sys.executable, "-c", PROGRAM], env=environment, timeout=90, check=True)
     except subprocess.TimeoutExpired as error:
-        raise AssertionError("jaxlib deadlocks in batched LAPACK calls: choose another version") from error
+        raise AssertionError(
+            "jaxlib deadlocks in batched LAPACK calls: choose another version"
+        ) from error

@@ -1,4 +1,6 @@
-"""Conditions by their density: normal ones against `InexactMatch`, others against quadrature, SciPy and NumPy."""
+"""Conditions by their density: normal ones against `InexactMatch`, others against quadrature, SciPy
+and NumPy.
+"""
 
 import equinox as eqx
 import jax
@@ -110,7 +112,9 @@ def test_evidence_is_that_of_quadrature(name):
     axis = np.linspace(-7, 7, 4001 if x0.size == 1 else 601)
     grid = np.stack(np.meshgrid(*[axis] * x0.size, indexing="ij"), -1).reshape(-1, *x0.shape)
     log_psi = jax.vmap(lambda x: match.log_density(BROWNIAN, x, jnp.asarray(v)))(grid)
-    log_prior = np.sum(scipy.stats.norm.logpdf(grid - x0, scale=np.sqrt(0.5)), axis=tuple(range(1, grid.ndim)))
+    log_prior = np.sum(
+        scipy.stats.norm.logpdf(grid - x0, scale=np.sqrt(0.5)), axis=tuple(range(1, grid.ndim))
+    )
     truth = scipy.special.logsumexp(log_psi + log_prior) + x0.size * np.log(axis[1] - axis[0])
     assert found.standard_error < 0.02
     assert nb.weights.pareto_k(found.log_weights) < 0.7
@@ -118,7 +122,9 @@ def test_evidence_is_that_of_quadrature(name):
 
 
 def test_a_path_of_heavy_tails_has_a_noise(key):
-    """Whatever factor is drawn; and that by its law given the path: joint draws against weighed independent ones."""
+    """Whatever factor is drawn; and that by its law given the path: joint draws against weighed
+    independent ones.
+    """
     match, x0 = nb.StudentMatch(0.05, 3.0), np.zeros(1)
     law = nb.DiffusionEndpoint(BROWNIAN, x0, match, t1=1.0, num_steps=2)
     bridge = nb.GuidedBridge(BROWNIAN, match.at([1.2]), x0=x0, t1=1.0, num_steps=2)
@@ -143,7 +149,9 @@ def test_a_path_of_heavy_tails_has_a_noise(key):
 
 
 def test_a_tilt_has_no_curvature():
-    """ψ = exp(a · x), of which the Gaussian that guides is nearly flat: log E exp(a · X) = a · m + ½ aᵀ C a."""
+    """ψ = exp(a · x), of which the Gaussian that guides is nearly flat: log E exp(a · X) = a · m +
+    ½ aᵀ C a.
+    """
     a = np.array([0.7, -1.2])
     match = nb.DensityMatch(lambda x, v, args: jnp.sum(args * x), a)
     bridge = nb.GuidedBridge(BROWNIAN, match.at(0.0), x0=VECTOR, t1=1.0, num_steps=3)
@@ -162,7 +170,9 @@ def test_a_module_is_a_function():
             return -0.5 * jnp.sum((x - observed - self.a) ** 2)
 
     def log_weight(a):
-        bridge = nb.GuidedBridge(BROWNIAN, nb.DensityMatch(Tilt(a)).at(VECTOR), x0=VECTOR, t1=1.0, num_steps=2)
+        bridge = nb.GuidedBridge(
+            BROWNIAN, nb.DensityMatch(Tilt(a)).at(VECTOR), x0=VECTOR, t1=1.0, num_steps=2
+        )
         return bridge.log_weight(np.zeros(bridge.noise_shape))
 
     value, slope = jax.jit(jax.value_and_grad(log_weight))(0.5)
@@ -179,7 +189,11 @@ def test_student_is_that_of_scipy():
     scale = np.diag(np.repeat(0.04 / np.array([0.3, 0.8]), 2))
     truth = scipy.stats.multivariate_t(x.ravel(), scale, 4.0).logpdf(v.ravel())
     match = nb.StudentMatch(0.04, 4.0)
-    close(match.log_density(nb.LinearSDE(0.0, 1.0, space=space), jnp.asarray(x), jnp.asarray(v)), truth, 1e-12)
+    close(
+        match.log_density(nb.LinearSDE(0.0, 1.0, space=space), jnp.asarray(x), jnp.asarray(v)),
+        truth,
+        1e-12,
+    )
     law = nb.DiffusionEndpoint(nb.BrownianMotion(1e-12), POINTS, match, t1=1.0, num_steps=1)
     draws = np.asarray(law.sample(jr.key(0), (20_000,))) - POINTS
     distance = np.sqrt(np.sum(draws**2, (1, 2)) / (4 * 0.04))  # √F(4, 4)
@@ -204,10 +218,14 @@ def test_procrustes_is_that_of_scipy(dim):
     turn = scipy.spatial.transform.Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()[:dim, :dim]
 
     def log_density(up_to, v):
-        return float(nb.ProcrustesMatch(0.01, up_to).log_density(BROWNIAN, jnp.asarray(x), jnp.asarray(v)))
+        return float(
+            nb.ProcrustesMatch(0.01, up_to).log_density(BROWNIAN, jnp.asarray(x), jnp.asarray(v))
+        )
 
     *_, disparity = scipy.spatial.procrustes(x, v)
-    close(log_density("similarity", v), -0.5 * disparity * np.sum((x - x.mean(0)) ** 2) / 0.01, 1e-9)
+    close(
+        log_density("similarity", v), -0.5 * disparity * np.sum((x - x.mean(0)) ** 2) / 0.01, 1e-9
+    )
     moved = {"translation": x + 1.0, "rigid": x @ turn + 1.0, "similarity": 2 * x @ turn + 1.0}
     free = [[log_density(up_to, shape) for shape in moved.values()] for up_to in moved]
     close(np.tril(free), np.zeros((3, 3)), 1e-9)
@@ -244,14 +262,21 @@ def inner_by_loops(x, y, closed):
 def test_distances_of_curves(closed, dim, key):
     """Values and slopes against double sums in NumPy, of curves with other numbers of points."""
     x, y = (np.asarray(jr.normal(k, (n, dim))) for k, n in zip(jr.split(key), (5, 7), strict=True))
-    matches = nb.VarifoldMatch(0.3, **SCALES, closed_curve=closed), nb.CurrentMatch(0.3, 0.4, closed_curve=closed)
+    matches = (
+        nb.VarifoldMatch(0.3, **SCALES, closed_curve=closed),
+        nb.CurrentMatch(0.3, 0.4, closed_curve=closed),
+    )
     for which, match in enumerate(matches):
 
         def log_density(x, which=which):
-            own, mixed, other = (inner_by_loops(*pair, closed)[which] for pair in ((x, x), (x, y), (y, y)))
+            own, mixed, other = (
+                inner_by_loops(*pair, closed)[which] for pair in ((x, x), (x, y), (y, y))
+            )
             return -0.5 * (own - 2 * mixed + other) / 0.3
 
-        value, slope = jax.value_and_grad(lambda x, m=match: m.log_density(BROWNIAN, x, jnp.asarray(y)))(jnp.asarray(x))
+        value, slope = jax.value_and_grad(
+            lambda x, m=match: m.log_density(BROWNIAN, x, jnp.asarray(y))
+        )(jnp.asarray(x))
         close(value, log_density(x), 1e-10)
         steps = 1e-5 * np.eye(x.size).reshape(-1, *x.shape)
         differences = [(log_density(x + step) - log_density(x - step)) / 2e-5 for step in steps]
@@ -259,7 +284,9 @@ def test_distances_of_curves(closed, dim, key):
 
 
 def test_curves_do_not_depend_on_their_points():
-    """Resampled, begun elsewhere, and with points that are not evenly spread: within 1 % at 64 points."""
+    """Resampled, begun elsewhere, and with points that are not evenly spread: within 1 % at 64
+    points.
+    """
     match = nb.VarifoldMatch(0.01, 0.3)
 
     def ellipse(count, start=0.0, uneven=0.0, width=1.0):
@@ -279,7 +306,9 @@ def test_precision_of_curves_is_the_curvature_where_they_meet(key):
     """By Gauss and Newton: the Hessian itself at the datum, and nowhere negative."""
     x = jnp.asarray(nb.datasets.ellipses(8).points[0])
     for match in (nb.VarifoldMatch(0.1, **SCALES), nb.CurrentMatch(0.1, 0.4)):
-        hessian = jax.hessian(lambda y, m=match: m.log_density(BROWNIAN, y.reshape(x.shape), x))(x.reshape(-1))
+        hessian = jax.hessian(lambda y, m=match: m.log_density(BROWNIAN, y.reshape(x.shape), x))(
+            x.reshape(-1)
+        )
         close(match.precision(BROWNIAN, x, x), -hessian, 1e-9)
         away = x + 0.1 * jr.normal(key, x.shape)
         assert np.min(np.linalg.eigvalsh(match.precision(BROWNIAN, away, x))) > -1e-9
@@ -295,7 +324,9 @@ def test_outlines_without_correspondence():
     found = nb.estimate_evidence(bridge, jr.key(0), 4000)
     free = nb.estimate_evidence(bridge.with_guide(nb.Unguided()), jr.key(1), 20_000)
     assert found.standard_error < 0.08 and free.standard_error < 0.05
-    assert abs(found.log_evidence - free.log_evidence) < 4 * np.hypot(found.standard_error, free.standard_error)
+    assert abs(found.log_evidence - free.log_evidence) < 4 * np.hypot(
+        found.standard_error, free.standard_error
+    )
     assert nb.weights.pareto_k(found.log_weights) < 0.7
 
 
@@ -303,12 +334,16 @@ def test_outlines_without_correspondence():
 
 
 def test_parameters_of_a_density_have_priors():
-    """In a model under jit, of an endpoint: density and slope those of the inexact match, in both precisions."""
+    """In a model under jit, of an endpoint: density and slope those of the inexact match, in both
+    precisions.
+    """
 
     def model(match, v):
         sd = numpyro.sample("sd", dist.LogNormal(-1.0, 0.5))
         rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
-        law = nb.DiffusionEndpoint(nb.LinearSDE(-rate, 0.7), VECTOR, match(sd**2), t1=1.0, num_steps=3)
+        law = nb.DiffusionEndpoint(
+            nb.LinearSDE(-rate, 0.7), VECTOR, match(sd**2), t1=1.0, num_steps=3
+        )
         nb.sample("v", law, obs=v)
 
     def log_joint(match, sd, rate, z):
@@ -325,7 +360,9 @@ def test_parameters_of_a_density_have_priors():
     jax.tree.map(lambda a, b: close(a, b, 1e-9), by_density(0.4, 0.9), truth)
     z = z.astype(np.float32)
     with jax.enable_x64(False):
-        single = of(lambda variance: nb.DensityMatch(normal, variance))(np.float32(0.4), np.float32(0.9))
+        single = of(lambda variance: nb.DensityMatch(normal, variance))(
+            np.float32(0.4), np.float32(0.9)
+        )
     jax.tree.map(lambda a, b: close(a, b, 2e-3), single, truth)
 
 
@@ -350,7 +387,8 @@ def test_a_function_is_held_as_it_is():
     setting["center"] = 1.5
     assert values(*first) == before
     after = values(*made())
-    truth = [-(c**2) - np.log(2.0) for c in (0.5, 1.5)]  # two columns of (1 + 2 · 0.5)^{-1/2} exp(−c²/2)
+    # two columns of (1 + 2 · 0.5)^{-1/2} exp(−c²/2)
+    truth = [-(c**2) - np.log(2.0) for c in (0.5, 1.5)]
     close(np.array([before, after]), np.repeat(truth, 2).reshape(2, 2), 1e-9)
 
 
@@ -374,7 +412,9 @@ def bridge_to(match, v=VECTOR, x0=VECTOR):
 
 
 ERRORS = {
-    "`log_density` must return one number; got shape \\(2,\\)": lambda: bridge_to(nb.DensityMatch(lambda x, v, a: x)),
+    "`log_density` must return one number; got shape \\(2,\\)": lambda: bridge_to(
+        nb.DensityMatch(lambda x, v, a: x)
+    ),
     "`log_density` must be finite and smooth; the log density is nan": lambda: bridge_to(
         nb.DensityMatch(lambda x, v, a: jnp.log(-1.0 - jnp.sum(x**2)))
     ),
@@ -382,9 +422,13 @@ ERRORS = {
         nb.DensityMatch(lambda x, v, a: -jnp.sum(jnp.sqrt(jnp.abs(x - VECTOR))))
     ),
     "`observed` must hold the points of a curve": lambda: nb.VarifoldMatch(0.1, 0.5).at(VECTOR),
-    "points \\[2\\] are repeated by the next one": lambda: nb.CurrentMatch(0.1, 0.5).at(SQUARE[[0, 1, 2, 2]]),
+    "points \\[2\\] are repeated by the next one": lambda: nb.CurrentMatch(0.1, 0.5).at(
+        SQUARE[[0, 1, 2, 2]]
+    ),
     "points \\[4\\] are repeated": lambda: nb.VarifoldMatch(0.1, 0.5).at(SQUARE[[0, 1, 2, 3, 0]]),
-    "`observed` must be shaped like a state": lambda: bridge_to(nb.StudentMatch(0.1, 3.0), np.ones(3)),
+    "`observed` must be shaped like a state": lambda: bridge_to(
+        nb.StudentMatch(0.1, 3.0), np.ones(3)
+    ),
     "`x0` must hold points in the plane or in space": lambda: bridge_to(nb.ProcrustesMatch(0.1)),
     "got a state \\(5, 2\\) of FourierBasis": lambda: nb.ProcrustesMatch(0.1).log_density(
         nb.LinearSDE(0.0, 1.0, space=nb.FourierBasis(2, 2)), jnp.ones((5, 2)), jnp.ones((5, 2))
@@ -396,7 +440,12 @@ ERRORS = {
         LINEAR, VECTOR, nb.StudentMatch(0.1, 3.0), tree=TREE.observing(["a", "a", "b"])
     ),
     "cannot be learned": lambda: nb.scores.fit(
-        BROWNIAN, nb.VarifoldMatch(0.1, 0.5).at(SQUARE), x0=SQUARE, t1=1.0, num_steps=2, key=jr.key(0)
+        BROWNIAN,
+        nb.VarifoldMatch(0.1, 0.5).at(SQUARE),
+        x0=SQUARE,
+        t1=1.0,
+        num_steps=2,
+        key=jr.key(0),
     ),
     "`guided_terms` are of the bridge `flat`": lambda: bridge_to(
         nb.VarifoldMatch(0.1, 0.5), SQUARE, SQUARE

@@ -1,8 +1,8 @@
 """Batches on several devices, and in several processes: the same numbers as on one.
 
-What the table runs is run here, on one device, and by this file as a script on 8 devices, and in two
-processes of two devices each. The referee is the run on one device, whose own referees are in the
-tests of what is run.
+What the table runs is run here, on one device, and by this file as a script on 8 devices, and in
+two processes of two devices each. The referee is the run on one device, whose own referees are in
+the tests of what is run.
 """
 
 import os
@@ -201,7 +201,8 @@ REFUSED = {
     ),
     "axes": (
         lambda: nb.spread(jnp.sin, GRID),
-        r"`mesh` must have one axis; got 2, \('rows', 'columns'\). Make it `jax.sharding.Mesh\(mesh.dev",
+        r"`mesh` must have one axis; got 2, \('rows', 'columns'\). Make it "
+        r"`jax.sharding.Mesh\(mesh.dev",
     ),
     "axis": (
         lambda: nb.spread(jnp.sin, GRID, axis="devices"),

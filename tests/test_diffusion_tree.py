@@ -1,4 +1,6 @@
-"""Laws on trees: the dense joint normal of linear processes, brute force for nonlinear ones, the way back to noise."""
+"""Laws on trees: the dense joint normal of linear processes, brute force for nonlinear ones, the
+way back to noise.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +30,9 @@ DATA = np.random.default_rng(0).normal(size=(len(SEEN), 3, 2))
 
 
 def random_tree(seed, count, zeros=True):
-    """Nodes in any order, polytomies, unifurcations, lengths of 0, some inner nodes seen and some tips not."""
+    """Nodes in any order, polytomies, unifurcations, lengths of 0, some inner nodes seen and some
+    tips not.
+    """
     rng = np.random.default_rng(seed)
     parents = [-1] + [int(rng.integers(max(0, i - 6), i)) for i in range(1, count)]
     lengths = rng.exponential(size=count)
@@ -56,7 +60,8 @@ def shared_times(tree):
 
 
 def joint(tree, x0, data, a, noise, rate=None, shift=0.0, root=0.0):
-    """Log density of all rows of data by one dense normal: dX = (shift − rate X) dt + √a dW, errors of each row.
+    """Log density of all rows of data by one dense normal: dX = (shift − rate X) dt + √a dW, errors
+    of each row.
 
     `root`: the covariance of the state at the root.
     """
@@ -65,7 +70,11 @@ def joint(tree, x0, data, a, noise, rate=None, shift=0.0, root=0.0):
     if rate is None:
         C, decay, drift = shared, jnp.ones_like(depth), shift * depth
     else:
-        C = jnp.exp(-rate * (depth[:, None] + depth[None])) * jnp.expm1(2 * rate * shared) / (2 * rate)
+        C = (
+            jnp.exp(-rate * (depth[:, None] + depth[None]))
+            * jnp.expm1(2 * rate * shared)
+            / (2 * rate)
+        )
         decay = jnp.exp(-rate * depth)
         drift = shift * -jnp.expm1(-rate * depth) / rate
     mean = decay[:, None, None] * x0 + drift[:, None, None]
@@ -75,13 +84,20 @@ def joint(tree, x0, data, a, noise, rate=None, shift=0.0, root=0.0):
     r = (data - mean).reshape(m * n, -1)
     L = jnp.linalg.cholesky(covariance)
     y = jax.scipy.linalg.solve_triangular(L, r, lower=True)
-    return -0.5 * jnp.sum(y * y) - r.shape[1] * (jnp.sum(jnp.log(jnp.diagonal(L))) + 0.5 * m * n * jnp.log(2 * jnp.pi))
+    return -0.5 * jnp.sum(y * y) - r.shape[1] * (
+        jnp.sum(jnp.log(jnp.diagonal(L))) + 0.5 * m * n * jnp.log(2 * jnp.pi)
+    )
 
 
 def brownian(p, tree, **settings):
     match = jax.vmap(nb.InexactMatch)(p["noise"])
     return nb.DiffusionTree(
-        nb.BrownianMotion(p["a"]), p["x0"], match, tree=tree.with_lengths(p["lengths"]), per_row=("match",), **settings
+        nb.BrownianMotion(p["a"]),
+        p["x0"],
+        match,
+        tree=tree.with_lengths(p["lengths"]),
+        per_row=("match",),
+        **settings,
     )
 
 
@@ -103,7 +119,11 @@ def parameters(tree, n, seed, **more):
     rng = np.random.default_rng(seed)
     m = len(tree.observed)
     root = rng.normal(size=(n, n))
-    p = {"a": root @ root.T + np.eye(n), "x0": rng.normal(size=(n, 2)), "noise": rng.uniform(0.02, 0.3, m)}
+    p = {
+        "a": root @ root.T + np.eye(n),
+        "x0": rng.normal(size=(n, 2)),
+        "noise": rng.uniform(0.02, 0.3, m),
+    }
     p |= {"lengths": tree.lengths, **more}
     return {name: jnp.asarray(x) for name, x in p.items()}, rng.normal(size=(m, n, 2))
 
@@ -131,36 +151,53 @@ def test_linear_processes_have_the_dense_normal(name, count):
     slopes, true_slopes = symmetric(slopes), symmetric(true_slopes)
     for key in p:
         size = 1 + np.max(np.abs(true_slopes[key]))
-        np.testing.assert_allclose(slopes[key], true_slopes[key], rtol=1e-6, atol=1e-6 * size, err_msg=key)
+        np.testing.assert_allclose(
+            slopes[key], true_slopes[key], rtol=1e-6, atol=1e-6 * size, err_msg=key
+        )
 
 
 class Still(nb.KunitaFlow):
-    """A flow whose field does not move with its landmarks, unknown to the library: its covariance is that at X0."""
+    """A flow whose field does not move with its landmarks, unknown to the library: its covariance
+    is that at X0.
+    """
 
     def noise(self, t, x):
         return super().noise(t, jnp.asarray(X0) + 0 * x)
 
 
-@pytest.mark.parametrize("guide", [nb.RecedingGuide(), nb.GeodesicGuide()], ids=["receding", "geodesic"])
+@pytest.mark.parametrize(
+    "guide", [nb.RecedingGuide(), nb.GeodesicGuide()], ids=["receding", "geodesic"]
+)
 @pytest.mark.parametrize("seen", ["all", "some", "exact"])
 def test_what_follows_is_the_message_of_a_constant_covariance(seen, guide):
-    """Every log weight is the dense normal's; to 1e-8, or 1e-5 where points are missing, for rounding's sake."""
+    """Every log weight is the dense normal's; to 1e-8, or 1e-5 where points are missing, for
+    rounding's sake.
+    """
     tree = random_tree(5, 14, zeros=seen != "exact")
     tips = [tree.names[tip] for tip in tree.tips]
     tree = tree.observing(tips if seen == "exact" else ["n13", "n12", "n11", "n10", "n9", "n4"])
     m = len(tree.observed)
     rng = np.random.default_rng(1)
-    data, errors, mask = rng.normal(size=(m, 3, 2)), rng.uniform(0.02, 0.3, m), rng.random((m, 3)) < 0.7
+    data, errors, mask = (
+        rng.normal(size=(m, 3, 2)),
+        rng.uniform(0.02, 0.3, m),
+        rng.random((m, 3)) < 0.7,
+    )
     flow = Still(nb.Landmarks(3, 2, weights=1.0), nb.GaussianKernel(0.7, 0.6))
     a = flow.covariance(0.0, X0)
     match, rows = jax.vmap(nb.InexactMatch)(errors), np.ones((m, 3), bool)
     if seen == "some":
-        match, rows = jax.vmap(lambda error, mask: nb.InexactMatch(error, mask=mask))(errors, mask), mask
+        match, rows = (
+            jax.vmap(lambda error, mask: nb.InexactMatch(error, mask=mask))(errors, mask),
+            mask,
+        )
     if seen == "exact":
         law = nb.DiffusionTree(flow, X0, nb.ExactMatch(), tree=tree, num_steps=3, guide=guide)
         errors = np.zeros(m)
     else:
-        law = nb.DiffusionTree(flow, X0, match, tree=tree, num_steps=3, guide=guide, per_row=("match",))
+        law = nb.DiffusionTree(
+            flow, X0, match, tree=tree, num_steps=3, guide=guide, per_row=("match",)
+        )
     z = jr.normal(jr.key(0), (3, *law.noise_prior().shape()))
     found = jax.jit(jax.vmap(lambda z: law.given(z).log_prob(data)))(z)
 
@@ -200,14 +237,20 @@ def test_a_thousand_tips():
     np.testing.assert_allclose(found, truth, rtol=1e-9)
 
 
-@pytest.mark.parametrize("guide", [nb.FrozenGuide(nb.LinearSDE(-0.7, np.linalg.cholesky(Q), 0.4)), nb.RecedingGuide()])
+@pytest.mark.parametrize(
+    "guide", [nb.FrozenGuide(nb.LinearSDE(-0.7, np.linalg.cholesky(Q), 0.4)), nb.RecedingGuide()]
+)
 def test_paths_of_a_linear_process_have_one_weight(guide, key):
-    """With every step taken, the weight is the likelihood for each noise: no constant is lost on the way down."""
+    """With every step taken, the weight is the likelihood for each noise: no constant is lost on
+    the way down.
+    """
     sde = nb.LinearSDE(-0.7, np.linalg.cholesky(Q), 0.4)
     law = nb.DiffusionTree(sde, X0, nb.InexactMatch(0.1), tree=TREE, num_steps=3, guide=guide)
     truth = joint(TREE, X0, DATA, Q, 0.1, 0.7, 0.4)
     z = jr.normal(key, (4, *law.noise_prior().shape()))
-    found = jax.jit(lambda z: law.expand((4,)).given(z).log_prob(jnp.broadcast_to(DATA, (4, *DATA.shape))))(z)
+    found = jax.jit(
+        lambda z: law.expand((4,)).given(z).log_prob(jnp.broadcast_to(DATA, (4, *DATA.shape)))
+    )(z)
     np.testing.assert_allclose(found, np.full(4, truth), rtol=1e-9)
 
 
@@ -225,7 +268,9 @@ def test_a_star_is_a_product_and_the_order_of_children_makes_no_difference():
     found = density(nb.DiffusionTree(sde, X0, match, tree=star), DATA[:3])
     np.testing.assert_allclose(found, sum(one_by_one), rtol=1e-11)
 
-    turned = nb.Tree.from_newick("((u:1):1,g:2,((f:0,e:1):.2,d:.5,c:3):0.1,(b:1.5,a:1)x:2):.3;").observing(SEEN)
+    turned = nb.Tree.from_newick(
+        "((u:1):1,g:2,((f:0,e:1):.2,d:.5,c:3):0.1,(b:1.5,a:1)x:2):.3;"
+    ).observing(SEEN)
     rows = dict(zip(TREE.observed_names, DATA, strict=True))
     laws = [nb.DiffusionTree(sde, X0, match, tree=tree) for tree in (TREE, turned)]
     values = [density(law, law.tree.rows(rows)) for law in laws]
@@ -241,7 +286,9 @@ def test_masks_of_their_own():
     rows = seen.ravel()
     C = np.kron(shared_times(TREE), Q) + 0.1 * np.eye(rows.size)
     r = (DATA - X0).reshape(rows.size, 2)
-    truth = sum(stats.multivariate_normal(None, C[rows][:, rows]).logpdf(r[rows, c]) for c in (0, 1))
+    truth = sum(
+        stats.multivariate_normal(None, C[rows][:, rows]).logpdf(r[rows, c]) for c in (0, 1)
+    )
     np.testing.assert_allclose(found, truth, rtol=1e-8)
 
 
@@ -259,15 +306,23 @@ SOME = np.array([[0.0, 0.0, 1.0], [1.0, 0.5, 0.0]])
 
 @pytest.mark.parametrize("own", [True, False], ids=["errors of their own", "one error"])
 def test_several_specimens_have_the_dense_normal(own):
-    """Value to 1e-8 and gradients to 1e-6: species share their past, specimens the state of their node."""
+    """Value to 1e-8 and gradients to 1e-6: species share their past, specimens the state of their
+    node.
+    """
     p = {"a": jnp.asarray(Q), "x0": jnp.asarray(X0), "lengths": MANY.lengths}
-    p |= {"noise": jnp.asarray(OWN if own else 0.1), "rate": jnp.asarray(0.7), "shift": jnp.asarray(0.4)}
+    p |= {
+        "noise": jnp.asarray(OWN if own else 0.1),
+        "rate": jnp.asarray(0.7),
+        "shift": jnp.asarray(0.4),
+    }
 
     def ours(p, data):
         sde = nb.LinearSDE(-p["rate"], jnp.linalg.cholesky(p["a"]), p["shift"])
         match = jax.vmap(nb.InexactMatch)(p["noise"]) if own else nb.InexactMatch(p["noise"])
         settings = {"per_row": ("match",)} if own else {}
-        law = nb.DiffusionTree(sde, p["x0"], match, tree=MANY.with_lengths(p["lengths"]), **settings)
+        law = nb.DiffusionTree(
+            sde, p["x0"], match, tree=MANY.with_lengths(p["lengths"]), **settings
+        )
         return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data)
 
     def truth(p, data):
@@ -279,7 +334,9 @@ def test_several_specimens_have_the_dense_normal(own):
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     np.testing.assert_allclose(slopes[1], true_slopes[1], rtol=1e-6, atol=1e-6)
     for key in p:
-        slope, true_slope = (s[key] + s[key].T if key == "a" else s[key] for s in (slopes[0], true_slopes[0]))
+        slope, true_slope = (
+            s[key] + s[key].T if key == "a" else s[key] for s in (slopes[0], true_slopes[0])
+        )
         size = 1 + np.max(np.abs(true_slope))
         np.testing.assert_allclose(slope, true_slope, rtol=1e-6, atol=1e-6 * size, err_msg=key)
 
@@ -296,11 +353,19 @@ FUSED = {
         [np.eye(3)[there] for there in THERE],
         [error * np.eye(there.sum()) for error, there in zip(OWN, THERE, strict=True)],
     ),
-    "one mask": (nb.InexactMatch(0.1, mask=[True, False, True]), np.eye(3)[[0, 2]], 0.1 * np.eye(2)),
+    "one mask": (
+        nb.InexactMatch(0.1, mask=[True, False, True]),
+        np.eye(3)[[0, 2]],
+        0.1 * np.eye(2),
+    ),
     "correlated": (nb.InexactMatch(ERROR), np.eye(3), ERROR),
     "correlated, their own": (matches(variance=EACH * ERROR), np.eye(3), EACH * ERROR),
     "one operator": (nb.InexactMatch(0.1, SOME), SOME, 0.1 * np.eye(2)),
-    "operators": (jax.vmap(lambda s: nb.InexactMatch(s, SOME))(jnp.asarray(OWN)), SOME, EACH * np.eye(2)),
+    "operators": (
+        jax.vmap(lambda s: nb.InexactMatch(s, SOME))(jnp.asarray(OWN)),
+        SOME,
+        EACH * np.eye(2),
+    ),
 }
 
 
@@ -337,7 +402,9 @@ def test_specimens_of_nonlinear_processes(key):
     z = jr.normal(key, law.noise_prior().shape())
     errors = 0.1 / np.asarray(FLOW.space.weights)[:, None]
     constant = stats.norm(means[owner], np.sqrt(errors)).logpdf(data).sum()
-    constant -= stats.norm(0, np.sqrt(errors / sizes[:, None, None])).logpdf(np.zeros_like(means)).sum()
+    constant -= (
+        stats.norm(0, np.sqrt(errors / sizes[:, None, None])).logpdf(np.zeros_like(means)).sum()
+    )
     expected = one.given(z).log_prob(means) + constant
     np.testing.assert_allclose(law.given(z).log_prob(data), expected, rtol=1e-10)
     np.testing.assert_allclose(law.given(z).path(data), one.given(z).path(means), atol=1e-10)
@@ -345,7 +412,8 @@ def test_specimens_of_nonlinear_processes(key):
 
 # The root.
 
-ROOTED = nb.Tree(MANY.parents, MANY.lengths, MANY.names, [0, 0, *MANY.observed])  # seen twice itself
+# seen twice itself
+ROOTED = nb.Tree(MANY.parents, MANY.lengths, MANY.names, [0, 0, *MANY.observed])
 ROOTED_ROWS = np.concatenate([ROWS, ROWS[:2] + 0.5])
 PRIOR = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 0.5]])
 OU = nb.LinearSDE(-0.7, np.linalg.cholesky(Q), 0.4)
@@ -361,27 +429,40 @@ def test_a_root_with_a_prior_has_the_dense_normal():
         return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(ROOTED_ROWS)
 
     def truth(p):
-        return joint(ROOTED, p["x0"], ROOTED_ROWS, Q, p["noise"], 0.7, 0.4, 0.5 * (p["root"] + p["root"].T))
+        return joint(
+            ROOTED, p["x0"], ROOTED_ROWS, Q, p["noise"], 0.7, 0.4, 0.5 * (p["root"] + p["root"].T)
+        )
 
     found, slopes = jax.jit(jax.value_and_grad(ours))(p)
     expected, true_slopes = jax.jit(jax.value_and_grad(truth))(p)
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     for key in p:
         size = 1 + np.max(np.abs(true_slopes[key]))
-        np.testing.assert_allclose(slopes[key], true_slopes[key], rtol=1e-6, atol=1e-6 * size, err_msg=key)
+        np.testing.assert_allclose(
+            slopes[key], true_slopes[key], rtol=1e-6, atol=1e-6 * size, err_msg=key
+        )
 
 
 @pytest.mark.parametrize("prior", [np.array([2.0, 0.5, 0.1]), PRIOR], ids=["diagonal", "matrix"])
 def test_the_posterior_of_the_root(prior, key):
-    """Every noise weighs the same; the root is drawn from its dense posterior, of which 0 is the mean."""
+    """Every noise weighs the same; the root is drawn from its dense posterior, of which 0 is the
+    mean.
+    """
     law = nb.DiffusionTree(
-        OU, X0, nb.InexactMatch(0.1), tree=ROOTED, num_steps=2, guide=nb.RecedingGuide(), root_covariance=prior
+        OU,
+        X0,
+        nb.InexactMatch(0.1),
+        tree=ROOTED,
+        num_steps=2,
+        guide=nb.RecedingGuide(),
+        root_covariance=prior,
     )
     matrix = np.diag(prior) if prior.ndim == 1 else prior
     truth = joint(ROOTED, X0, ROOTED_ROWS, Q, 0.1, 0.7, 0.4, matrix)
     laws = law.expand((8,))
     z = jr.normal(key, laws.noise_prior().shape())
-    z = z.at[:7, 1:].set(0).at[:4, 0].set(0).at[1:4, 0, :, 0].set(np.eye(3))  # the mean, columns of a factor, any
+    # the mean, columns of a factor, any
+    z = z.at[:7, 1:].set(0).at[:4, 0].set(0).at[1:4, 0, :, 0].set(np.eye(3))
     data = np.broadcast_to(ROOTED_ROWS, (8, *ROOTED_ROWS.shape))
     np.testing.assert_allclose(laws.given(z).log_prob(data), np.full(8, truth), rtol=1e-9)
     roots = laws.given(z).nodes(data)[:, 0]
@@ -403,7 +484,11 @@ def test_samples_with_a_root_that_varies():
     """Tips and root have the covariance of the tree and of the root."""
     tree = nb.Tree(SMALL.parents, SMALL.lengths, SMALL.names, [0, *SMALL.observed])
     law = nb.DiffusionTree(
-        nb.BrownianMotion(0.8), np.ones(2), nb.InexactMatch(0.05), tree=tree, root_covariance=np.array([0.5, 2.0])
+        nb.BrownianMotion(0.8),
+        np.ones(2),
+        nb.InexactMatch(0.05),
+        tree=tree,
+        root_covariance=np.array([0.5, 2.0]),
     )
     draws = np.asarray(law.sample(jr.key(2), (8000,)))
     for i, variance in enumerate((0.5, 2.0)):
@@ -427,7 +512,9 @@ def test_rates_are_lengths():
         return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
 
     def by_length(rates):
-        law = nb.DiffusionTree(nb.BrownianMotion(Q), X0, nb.InexactMatch(0.1), tree=TREE.scaled(rates))
+        law = nb.DiffusionTree(
+            nb.BrownianMotion(Q), X0, nb.InexactMatch(0.1), tree=TREE.scaled(rates)
+        )
         return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(DATA)
 
     found, slopes = jax.jit(jax.value_and_grad(by_regime))(rates)
@@ -439,9 +526,15 @@ def test_rates_are_lengths():
 def test_regimes_have_the_dense_normal():
     """Ornstein–Uhlenbeck processes of two kinds, from a root that varies."""
     kind = TREE.clade("c", "d", "e").astype(int)
-    rate, shift, scale = np.array([0.4, 1.5])[kind], np.array([0.4, -0.6])[kind], np.array([1.0, 0.3])[kind]
+    rate, shift, scale = (
+        np.array([0.4, 1.5])[kind],
+        np.array([0.4, -0.6])[kind],
+        np.array([1.0, 0.3])[kind],
+    )
     lengths, size = np.asarray(TREE.lengths), TREE.num_nodes
-    sdes = jax.vmap(lambda r, b, s: nb.LinearSDE(-r, jnp.sqrt(s) * np.linalg.cholesky(Q), b))(rate, shift, scale)
+    sdes = jax.vmap(lambda r, b, s: nb.LinearSDE(-r, jnp.sqrt(s) * np.linalg.cholesky(Q), b))(
+        rate, shift, scale
+    )
     law = nb.DiffusionTree(
         sdes, X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",), root_covariance=0.7 * Q
     )
@@ -454,7 +547,9 @@ def test_regimes_have_the_dense_normal():
         weight[node] = decay[e] * weight[parent]
         push[node] = decay[e] * push[parent] + shift[e] * (1 - decay[e]) / rate[e]
         C[node, :node] = C[:node, node] = decay[e] * C[parent, :node]
-        C[node, node] = decay[e] ** 2 * C[parent, parent] + scale[e] * (1 - decay[e] ** 2) / (2 * rate[e])
+        C[node, node] = decay[e] ** 2 * C[parent, parent] + scale[e] * (1 - decay[e] ** 2) / (
+            2 * rate[e]
+        )
     seen = np.array(TREE.observed)
     covariance = np.kron(C[np.ix_(seen, seen)], Q) + 0.1 * np.eye(3 * len(seen))
     r = (DATA - weight[seen, None, None] * X0 - push[seen, None, None]).reshape(-1, 2)
@@ -463,17 +558,25 @@ def test_regimes_have_the_dense_normal():
 
 
 def test_regimes_of_nonlinear_processes(key):
-    """Coefficients r b and √r σ for a time t are b and σ for r t: the same weight; and the way back."""
+    """Coefficients r b and √r σ for a time t are b and σ for r t: the same weight; and the way
+    back.
+    """
     rates = jnp.linspace(0.5, 2.0, TREE.num_nodes - 1)
 
     def sde(r):
         return nb.SDE(lambda t, x, r: r * jnp.sin(x), lambda t, x, r: 0.6 * jnp.sqrt(r), r)
 
     settings = {"num_steps": 3, "root_covariance": 0.3}
-    law = nb.DiffusionTree(jax.vmap(sde)(rates), X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",), **settings)
-    scaled = nb.DiffusionTree(sde(1.0), X0, nb.InexactMatch(0.1), tree=TREE.scaled(rates), **settings)
+    law = nb.DiffusionTree(
+        jax.vmap(sde)(rates), X0, nb.InexactMatch(0.1), tree=TREE, per_edge=("sde",), **settings
+    )
+    scaled = nb.DiffusionTree(
+        sde(1.0), X0, nb.InexactMatch(0.1), tree=TREE.scaled(rates), **settings
+    )
     z = jr.normal(key, law.noise_prior().shape())
-    np.testing.assert_allclose(law.given(z).log_prob(DATA), scaled.given(z).log_prob(DATA), rtol=1e-10)
+    np.testing.assert_allclose(
+        law.given(z).log_prob(DATA), scaled.given(z).log_prob(DATA), rtol=1e-10
+    )
 
     @jax.jit
     def there_and_back(key):
@@ -489,7 +592,9 @@ def test_regimes_of_nonlinear_processes(key):
 
 
 def sine(p):
-    return nb.SDE(lambda t, x, a: a * jnp.sin(x) + 0.2 * t, lambda t, x, a: 0.6 + 0.1 * jnp.cos(x), p)
+    return nb.SDE(
+        lambda t, x, a: a * jnp.sin(x) + 0.2 * t, lambda t, x, a: 0.6 + 0.1 * jnp.cos(x), p
+    )
 
 
 SMALL = nb.Tree.from_newick("((a:.5,b:.7):.4,c:.6);")
@@ -538,7 +643,12 @@ def test_evidence_by_brute_force(name):
     assert error < 0.01 * truth
 
     law = nb.DiffusionTree(
-        sine(1.0), np.array([x0]), nb.InexactMatch(variance), tree=tree, num_steps=num_steps, root_covariance=root
+        sine(1.0),
+        np.array([x0]),
+        nb.InexactMatch(variance),
+        tree=tree,
+        num_steps=num_steps,
+        root_covariance=root,
     )
     z = jr.normal(jr.key(counts[-1]), (6000, *law.noise_prior().shape()))
     log_weights = jax.jit(jax.vmap(lambda z: law.given(z).log_prob(data)))(z)
@@ -566,17 +676,23 @@ NARROW = nb.SDE(lambda t, x, a: -x, lambda t, x, a: jnp.stack([jnp.cos(x[:, 0]),
 
 
 SEVERAL_WAYS = [
-    pytest.param(name, marks=pytest.mark.slow if name in ("some points", "chain", "one branch") else ())
+    pytest.param(
+        name, marks=pytest.mark.slow if name in ("some points", "chain", "one branch") else ()
+    )
     for name in KINDS
 ]
 
 
 @pytest.mark.parametrize("name", SEVERAL_WAYS)
 def test_the_way_back_to_the_noise(name, key):
-    """Simulated paths are those of their noise; paths meet at the nodes, and end in what is seen exactly."""
+    """Simulated paths are those of their noise; paths meet at the nodes, and end in what is seen
+    exactly.
+    """
     match, tree, guide = KINDS[name]
     sde = NARROW if name.startswith("fewer") else FLOW
-    law = nb.DiffusionTree(sde, X0, match, tree=tree, guide=guide, **({"num_steps": 3} | OTHERS.get(name, {})))
+    law = nb.DiffusionTree(
+        sde, X0, match, tree=tree, guide=guide, **({"num_steps": 3} | OTHERS.get(name, {}))
+    )
 
     @jax.jit
     def there_and_back(key):
@@ -618,22 +734,31 @@ def test_steps_of_their_own(key):
         return law._log_prob_by_block(DATA[:3]), law.log_prob_by_node(DATA[:3]), law.path(DATA[:3])
 
     blocks, by_node, paths = zip(found(law, z), found(pieces, z), strict=True)
-    np.testing.assert_allclose(jax.jit(lambda z: law.given(z).log_prob(DATA[:3]))(z), np.sum(blocks[1]), rtol=1e-12)
+    np.testing.assert_allclose(
+        jax.jit(lambda z: law.given(z).log_prob(DATA[:3]))(z), np.sum(blocks[1]), rtol=1e-12
+    )
     branch = [0, 1, 1, 2, 2, 3, 3, 3, 4, 4]
     np.testing.assert_allclose(blocks[0], np.bincount(branch, blocks[1]), rtol=1e-12)
-    np.testing.assert_allclose(by_node[0], blocks[0][np.array([2, 3, 4])], rtol=1e-12)  # a tip's own is its branch
+    # a tip's own is its branch
+    np.testing.assert_allclose(by_node[0], blocks[0][np.array([2, 3, 4])], rtol=1e-12)
     np.testing.assert_allclose(by_node[1], by_node[0], rtol=1e-12)
     nodes = jax.jit(lambda z: law.given(z).nodes(DATA[:3]))(z)
     np.testing.assert_allclose(nodes[1:], paths[1][np.array([1, 3, 6, 8]), -1], rtol=1e-12)
-    np.testing.assert_allclose(paths[0][2, :7], np.concatenate([paths[1][4], *paths[1][5:7, 1:]]), rtol=1e-12)
+    np.testing.assert_allclose(
+        paths[0][2, :7], np.concatenate([paths[1][4], *paths[1][5:7, 1:]]), rtol=1e-12
+    )
     assert np.all(np.isnan(paths[0][0, 5:])) and np.all(np.isfinite(paths[0][0, :5]))
     np.testing.assert_allclose(law.times[2], 0.9 + 0.7 * np.arange(7) / 6)
 
 
 @pytest.mark.parametrize("columns", [(), (2,)], ids=["vectors", "columns"])
 def test_states_of_all_nodes(columns, key):
-    """Ends of the branches in the tree's order; NaN where a node leads to nothing seen, and where the law is masked."""
-    law = nb.DiffusionTree(nb.BrownianMotion(Q), X0[(..., *(0,) * (1 - len(columns)))], nb.InexactMatch(0.1), tree=TREE)
+    """Ends of the branches in the tree's order; NaN where a node leads to nothing seen, and where
+    the law is masked.
+    """
+    law = nb.DiffusionTree(
+        nb.BrownianMotion(Q), X0[(..., *(0,) * (1 - len(columns)))], nb.InexactMatch(0.1), tree=TREE
+    )
     data = DATA[(..., *(0,) * (1 - len(columns)))]
     law = law.expand((2,)).given(jr.normal(key, law.expand((2,)).noise_prior().shape()))
     data = np.stack([data, data + 1])
@@ -643,7 +768,9 @@ def test_states_of_all_nodes(columns, key):
     np.testing.assert_array_equal(states[:, np.array(active)], paths[:, :, -1])
     np.testing.assert_array_equal(states[0, 0], law.parts["x0"])
     unseen = sorted(set(range(TREE.num_nodes)) - {0, *active})
-    assert [TREE.names[node] for node in unseen] == [None, "u"] and np.all(np.isnan(states[:, np.array(unseen)]))
+    assert [TREE.names[node] for node in unseen] == [None, "u"] and np.all(
+        np.isnan(states[:, np.array(unseen)])
+    )
     masked = law.mask(np.array([True, False])).nodes(data)
     assert np.all(np.isnan(masked[1])) and np.array_equal(masked[0], states[0], equal_nan=True)
 
@@ -657,7 +784,9 @@ def test_one_branch_is_an_endpoint(key):
     np.testing.assert_allclose(
         branch.given(z).log_prob(DATA[:1]), endpoint.given(z).log_prob(DATA[0]), rtol=1e-8
     )
-    np.testing.assert_allclose(branch.given(z).path(DATA[:1])[0], endpoint.given(z).path(DATA[0]), atol=1e-6)
+    np.testing.assert_allclose(
+        branch.given(z).path(DATA[:1])[0], endpoint.given(z).path(DATA[0]), atol=1e-6
+    )
 
 
 # In NumPyro.
@@ -666,7 +795,9 @@ def test_one_branch_is_an_endpoint(key):
 def model(data=None, tree=SMALL):
     rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.5))
     sde = nb.BrownianMotion(rate)
-    nb.sample("tips", nb.DiffusionTree(sde, np.zeros((4, 2)), nb.InexactMatch(0.05), tree=tree), obs=data)
+    nb.sample(
+        "tips", nb.DiffusionTree(sde, np.zeros((4, 2)), nb.InexactMatch(0.05), tree=tree), obs=data
+    )
 
 
 def test_posterior_of_a_rate():
@@ -674,7 +805,8 @@ def test_posterior_of_a_rate():
     data = np.random.default_rng(2).normal(size=(3, 4, 2))
     log_rates = np.linspace(-3, 3, 400)
     log_density = [
-        stats.norm(0, 0.5).logpdf(r) + joint(SMALL, np.zeros((4, 2)), data, np.exp(r) * np.eye(4), 0.05)
+        stats.norm(0, 0.5).logpdf(r)
+        + joint(SMALL, np.zeros((4, 2)), data, np.exp(r) * np.eye(4), 0.05)
         for r in log_rates
     ]
     w = np.exp(log_density - np.max(log_density))
@@ -708,8 +840,12 @@ def test_specimens_share_the_state_of_their_node():
 
 def test_branch_lengths_have_priors():
     def clock(data):
-        rates = numpyro.sample("rates", dist.LogNormal(0.0, 0.5).expand([SMALL.num_nodes - 1]).to_event(1))
-        law = nb.DiffusionTree(nb.BrownianMotion(1.0), np.zeros(2), nb.InexactMatch(0.05), tree=SMALL.scaled(rates))
+        rates = numpyro.sample(
+            "rates", dist.LogNormal(0.0, 0.5).expand([SMALL.num_nodes - 1]).to_event(1)
+        )
+        law = nb.DiffusionTree(
+            nb.BrownianMotion(1.0), np.zeros(2), nb.InexactMatch(0.05), tree=SMALL.scaled(rates)
+        )
         nb.sample("tips", law, obs=data)
 
     data = np.random.default_rng(2).normal(size=(3, 2))
@@ -719,7 +855,8 @@ def test_branch_lengths_have_priors():
 
 
 def test_priors_on_everything_in_both_precisions():
-    """Kernel, errors of each tip, lengths, root and guide, inside a model under jit, branches with steps of their own.
+    """Kernel, errors of each tip, lengths, root and guide, inside a model under jit, branches with
+    steps of their own.
 
     float32 within 0.02 of float64.
     """
@@ -738,14 +875,28 @@ def test_priors_on_everything_in_both_precisions():
         start = numpyro.sample("start", dist.Normal(circle, 0.1).to_event(2))
         correction = numpyro.sample("correction", dist.Uniform(0.0, 1.0))
         guide = nb.GeodesicGuide(correction, numpyro.sample("end_weight", dist.Uniform(0.0, 0.5)))
-        flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale), noise=nb.LandmarkNoise(1e-5))
+        flow = nb.KunitaFlow(
+            space, nb.GaussianKernel(amplitude, length_scale), noise=nb.LandmarkNoise(1e-5)
+        )
         match = jax.vmap(lambda sd: nb.InexactMatch(sd**2, space=space))(sd)
         tree_law = nb.DiffusionTree(
-            flow, start, match, tree=tree.scaled(rates), num_steps=counts, guide=guide, per_row=("match",)
+            flow,
+            start,
+            match,
+            tree=tree.scaled(rates),
+            num_steps=counts,
+            guide=guide,
+            per_row=("match",),
         )
         nb.sample("tips", tree_law, obs=data)
 
-    values = {"amplitude": 0.4, "length_scale": 0.7, "sd": np.full(7, 0.05), "start": circle, "end_weight": 0.1}
+    values = {
+        "amplitude": 0.4,
+        "length_scale": 0.7,
+        "sd": np.full(7, 0.05),
+        "start": circle,
+        "end_weight": 0.1,
+    }
     values |= {"rates": np.linspace(0.8, 1.2, size), "correction": 0.6}
     values |= {"tips_noise": np.random.default_rng(0).normal(size=(sum(counts), 6, 2))}
 
@@ -761,41 +912,62 @@ def test_priors_on_everything_in_both_precisions():
     for name in values:
         largest = np.max(np.abs(slopes[name]))
         assert largest > 0
-        np.testing.assert_allclose(single_slopes[name], slopes[name], rtol=0, atol=2e-3 * largest, err_msg=name)
+        np.testing.assert_allclose(
+            single_slopes[name], slopes[name], rtol=0, atol=2e-3 * largest, err_msg=name
+        )
 
 
 WRONG = {
     "tree": (lambda: law(tree="(a:1);"), "`tree` must be a `Tree`"),
     "match": (lambda: law(match=nb.FrozenGuide()), "`match` must be a model of observation"),
-    "root": (lambda: law(tree=nb.Tree([-1, 0], [1.0], None, [0, 1])), "`tree` must not have its root among"),
+    "root": (
+        lambda: law(tree=nb.Tree([-1, 0], [1.0], None, [0, 1])),
+        "`tree` must not have its root among",
+    ),
     "root alone": (
         lambda: law(tree=nb.Tree([-1, 0], [1.0], None, [0]), root_covariance=1.0),
         "`tree` must have a seen node besides its root",
     ),
-    "prior": (lambda: law(root_covariance=np.ones(2)), r"`root_covariance` must be a number, \(3,\) or \(3, 3\)"),
+    "prior": (
+        lambda: law(root_covariance=np.ones(2)),
+        r"`root_covariance` must be a number, \(3,\) or \(3, 3\)",
+    ),
     "no prior": (lambda: law(root_covariance=-1.0), "`root_covariance` must be positive definite"),
     "steps": (lambda: law(sde=sine(1.0)), "`num_steps` must be given"),
     "no steps": (lambda: law(num_steps=0), "`num_steps` must be a positive integer; got 0"),
-    "steps of other branches": (lambda: law(num_steps=(2, 3)), "`num_steps` must be positive integers, one for each"),
-    "no steps somewhere": (lambda: law(num_steps=[2, 2, 0, 2]), "`num_steps` must be positive integers"),
+    "steps of other branches": (
+        lambda: law(num_steps=(2, 3)),
+        "`num_steps` must be positive integers, one for each",
+    ),
+    "no steps somewhere": (
+        lambda: law(num_steps=[2, 2, 0, 2]),
+        "`num_steps` must be positive integers",
+    ),
     "inner exact": (lambda: law(match=nb.ExactMatch()), "1 of the seen nodes are no tips"),
     "several exact": (
         lambda: law(match=nb.ExactMatch(), tree=TREE.observing(list("aabcc"))),
         "and 2 rows are of nodes that have one",
     ),
-    "bins": (lambda: law(match=nb.IntervalCensored([0.0])), "`match` must see a value at each node"),
+    "bins": (
+        lambda: law(match=nb.IntervalCensored([0.0])),
+        "`match` must see a value at each node",
+    ),
     "per_edge": (lambda: law(per_edge=("match",)), "`per_edge` may hold 'sde'"),
     "one SDE": (
         lambda: law(sde=nb.BrownianMotion(Q), per_edge=("sde",)),
         "`sde` is in `per_edge`, so every array of it must have 13 rows, one for each branch",
     ),
     "no arrays": (
-        lambda: law(sde=nb.SDE(lambda t, x, a: -x, lambda t, x, a: 1.0), per_edge=("sde",), num_steps=2),
+        lambda: law(
+            sde=nb.SDE(lambda t, x, a: -x, lambda t, x, a: 1.0), per_edge=("sde",), num_steps=2
+        ),
         "`sde` is in `per_edge`, and has no array to have one for each branch",
     ),
     "spaces": (
         lambda: law(
-            sde=jax.vmap(lambda w: nb.BrownianMotion(w, space=nb.Landmarks(3, 2, weights=w)))(jnp.arange(1.0, 14.0)),
+            sde=jax.vmap(lambda w: nb.BrownianMotion(w, space=nb.Landmarks(3, 2, weights=w)))(
+                jnp.arange(1.0, 14.0)
+            ),
             per_edge=("sde",),
         ),
         "`sde` must have one space on all branches",
@@ -806,7 +978,10 @@ WRONG = {
         "`match` is in `per_row`, so every array of it must have 8 rows",
     ),
     "data": (lambda: density(DATA[:3]), r"`value`, an observation, must have shape \(8, 3, 2\)"),
-    "several trees": (lambda: density(np.stack([DATA, DATA])), "holds 2 observations.*One noise shared"),
+    "several trees": (
+        lambda: density(np.stack([DATA, DATA])),
+        "holds 2 observations.*One noise shared",
+    ),
     "NaN": (lambda: density(np.where(DATA > 1, np.nan, DATA)), "finite"),
     "start": (lambda: law(x0=np.zeros((2, 3, 2))), r"`x0` must be one state"),
 }
@@ -814,7 +989,9 @@ WRONG = {
 
 def law(sde=None, x0=X0, match=None, tree=TREE, **settings):
     sde = nb.BrownianMotion(Q) if sde is None else sde
-    return nb.DiffusionTree(sde, x0, nb.InexactMatch(0.1) if match is None else match, tree=tree, **settings)
+    return nb.DiffusionTree(
+        sde, x0, nb.InexactMatch(0.1) if match is None else match, tree=tree, **settings
+    )
 
 
 def density(data):

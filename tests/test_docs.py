@@ -46,7 +46,8 @@ for path, found in blocks[int(first) :: int(count)]:
     ids=["extending", "others", "models"],
 )
 def test_code_runs_as_it_stands(names, tmp_path):
-    """Every block by itself, in single precision as a user's process has it; an error names the line of the page.
+    """Every block by itself, in single precision as a user's process has it; an error names the
+    line of the page.
 
     Two processes share the blocks. The README's first page is run by test_examples.py.
     """
@@ -72,7 +73,11 @@ def test_code_runs_on_many_devices(tmp_path):
 
 def printed_by(calls, folder) -> str:
     """What the processes print that run blocks of pages, each with an environment of its own."""
-    quick = {"OPENBLAS_NUM_THREADS": "1", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "PYTHONPATH": str(ROOT)}
+    quick = {
+        "OPENBLAS_NUM_THREADS": "1",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+        "PYTHONPATH": str(ROOT),
+    }
     told = "ignore:residual brought nothing:UserWarning"  # of a page's few updates, which says so
     program = [sys.executable, "-W", "error::UserWarning", "-W", told, "-c", RUN_BLOCKS]
     running = [
@@ -93,7 +98,9 @@ def printed_by(calls, folder) -> str:
 
 @pytest.mark.slow
 def test_code_has_the_right_types(tmp_path):
-    """What the pages pass is what the annotations take: pyright over every block, with the settings of the package."""
+    """What the pages pass is what the annotations take: pyright over every block, with the settings
+    of the package.
+    """
     pytest.importorskip("pyright")
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
@@ -102,9 +109,19 @@ def test_code_has_the_right_types(tmp_path):
             (tmp_path / f"{page.stem}_{line}.py").write_text(found.group(1), encoding="utf-8")
     settings = {"extraPaths": [str(ROOT)], "typeCheckingMode": "basic", "pythonVersion": "3.11"}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings))
-    checker = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--project", str(tmp_path)]
+    checker = [
+        sys.executable,
+        "-m",
+        "pyright",
+        "--pythonpath",
+        sys.executable,
+        "--project",
+        str(tmp_path),
+    ]
     quiet = {"PYRIGHT_PYTHON_IGNORE_WARNINGS": "1"}
-    done = subprocess.run(checker, env=os.environ | quiet, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        checker, env=os.environ | quiet, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -120,9 +137,13 @@ def test_bibliography_is_well_formed():
         assert fields(body)["year"] == key[-4:], key
 
 
-@pytest.mark.parametrize("path", [*PAGES, *SOURCES], ids=lambda path: path.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize(
+    "path", [*PAGES, *SOURCES], ids=lambda path: path.relative_to(ROOT).as_posix()
+)
 def test_citations_exist(path):
-    """Keys, [@key], and names with a year, "Gower 1975" or "Mider, Schauer and van der Meulen (2021)"."""
+    """Keys, [@key], and names with a year, "Gower 1975" or "Mider, Schauer and van der Meulen
+    (2021)".
+    """
     text = path.read_text(encoding="utf-8")
     for key in re.findall(r"\[@(\w+)\]", text):
         assert key in ENTRIES, f"{key} is not in references.bib"
@@ -130,9 +151,13 @@ def test_citations_exist(path):
         text = text[: text.rindex("References")]
     for found in re.finditer(r"(?:\b[A-Z][\w’']+|\bal\.),? \(?((?:19|20)\d\d)\b", text):
         before, year = text[max(found.start() - 60, 0) : found.end()], found.group(1)
-        authors = [fields(body)["author"] for body in ENTRIES.values() if fields(body)["year"] == year]
+        authors = [
+            fields(body)["author"] for body in ENTRIES.values() if fields(body)["year"] == year
+        ]
         surnames = [author.split(",")[0] for names in authors for author in names.split(" and ")]
-        assert any(surname in before for surname in surnames), f"no entry of {year} for “{before[-40:]}”"
+        assert any(surname in before for surname in surnames), (
+            f"no entry of {year} for “{before[-40:]}”"
+        )
 
 
 def test_every_entry_is_cited():
@@ -147,15 +172,23 @@ def test_versions_agree():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     assert re.search(r"^version: (\S+)$", citation, re.M).group(1) == project["version"]
     assert re.search(r'^  version: "(\S+)"$', recipe, re.M).group(1) == project["version"]
-    assert f"## {project['version']}" in (ROOT / "docs" / "changelog.md").read_text(encoding="utf-8")
+    assert f"## {project['version']}" in (ROOT / "docs" / "changelog.md").read_text(
+        encoding="utf-8"
+    )
     needed = {requirement.replace(" ", "") for requirement in project["dependencies"]}
     run = recipe[recipe.index("  run:") : recipe.index("tests:")]
-    packaged = {line.replace(" ", "") for line in re.findall(r"^    - (.*)$", run, re.M) if "python" not in line}
+    packaged = {
+        line.replace(" ", "")
+        for line in re.findall(r"^    - (.*)$", run, re.M)
+        if "python" not in line
+    }
     assert packaged == needed
 
 
 def test_lowest_versions_are_the_bounds():
-    """The constraints with which CI runs once are those that `pyproject.toml` claims, or what others need."""
+    """The constraints with which CI runs once are those that `pyproject.toml` claims, or what
+    others need.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines = (ROOT / ".ci" / "lowest.txt").read_text(encoding="utf-8")
     lowest = dict(re.findall(r"^(\S+)==(\S+)$", lines, re.M))
@@ -171,4 +204,6 @@ def test_top_level_names_have_docstrings():
     for name in names:
         value = getattr(nb, name)
         text = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
-        assert text or re.fullmatch(r"[a-z]+", name) and inspect.ismodule(value), f"{name} has no docstring"
+        assert text or re.fullmatch(r"[a-z]+", name) and inspect.ismodule(value), (
+            f"{name} has no docstring"
+        )

@@ -26,7 +26,9 @@ def test_derivative_of_the_drive(key):
 
 @pytest.mark.parametrize("over", [3, 4])
 def test_derivative_of_a_batch(key, over):
-    """By what a batch shares: the sum of its examples' derivatives, log determinants that it shares included."""
+    """By what a batch shares: the sum of its examples' derivatives, log determinants that it shares
+    included.
+    """
     keys = jr.split(key, 6)
     shapes = (3, 4), (3, 3), (3, 3), (3, 2), (4, 2)
     A, X, Y, r, z = (jr.normal(k, shape) for k, shape in zip(keys, shapes, strict=False))

@@ -1,8 +1,9 @@
 """Is the standard error of an estimate called trusted to be believed? Against means that are known.
 
-Nominal 95 % intervals have to cover at least 90 % of the times among the estimates called trusted, at 256, 1024
-and 4096 particles: not on average over samples, but for each law of weights, heavy tails and asymmetric misses
-included. An interval that misses more often than binomial chance allows at 90 % once in 10,000 is a failure.
+Nominal 95 % intervals have to cover at least 90 % of the times among the estimates called trusted,
+at 256, 1024 and 4096 particles: not on average over samples, but for each law of weights, heavy
+tails and asymmetric misses included. An interval that misses more often than binomial chance allows
+at 90 % once in 10,000 is a failure.
 """
 
 import math
@@ -83,7 +84,11 @@ def check_coverage(log_evidence, standard_error, truth, at_least=20):
     trusted = np.isfinite(standard_error)
     z = (np.asarray(log_evidence)[trusted] - truth) / np.asarray(standard_error)[trusted]
     misses, n = np.sum(np.abs(z) > 1.96), z.size
-    found = {"trusted": trusted.mean(), "coverage": 1 - misses / max(n, 1), "mean z": z.mean() if n else math.nan}
+    found = {
+        "trusted": trusted.mean(),
+        "coverage": 1 - misses / max(n, 1),
+        "mean z": z.mean() if n else math.nan,
+    }
     if n >= at_least:
         assert misses <= scipy.stats.binom(n, 1 - COVERAGE).ppf(1 - CHANCE), found
     return found
@@ -116,14 +121,20 @@ def test_what_is_trusted_covers(sweep, size):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_light_tails_are_trusted_and_their_error_is_their_spread(sweep, size):
-    """Up to an SD of the log weight of 1 from 1024 particles on; 256 know less of their tail, and say so."""
+    """Up to an SD of the log weight of 1 from 1024 particles on; 256 know less of their tail, and
+    say so.
+    """
     allowed = {256: 1.6, 1024: 1.2, 4096: 1.1}[size]
     for name in ("lognormal 0.3", "lognormal 0.6", "lognormal 1.0", "pareto 0.1"):
         estimates, errors, _ = sweep[name, size]
         assert np.isfinite(errors).mean() >= (0.95 if size == 256 else 0.99), name
         chance = 4 / math.sqrt(2 * SIZES[size])  # of the spread of so many estimates
         ratio = np.median(errors) / estimates.std()
-        assert 1 - chance < ratio < (allowed + chance) * (1.6 if name == "lognormal 1.0" and size == 256 else 1), name
+        assert (
+            1 - chance
+            < ratio
+            < (allowed + chance) * (1.6 if name == "lognormal 1.0" and size == 256 else 1)
+        ), name
 
 
 def test_a_mean_that_hardly_exists_is_not_trusted(sweep):
@@ -134,7 +145,9 @@ def test_a_mean_that_hardly_exists_is_not_trusted(sweep):
 
 
 def geometric_evidence(ts, v, variance):
-    """Of the Euler model of dX = 0.1 X dt + 0.4 X dW from 1, seen at the end with noise, by quadrature."""
+    """Of the Euler model of dX = 0.1 X dt + 0.4 X dW from 1, seen at the end with noise, by
+    quadrature.
+    """
     grid = np.linspace(0.01, 4, 1200)
 
     def step(x, y, dt):
@@ -152,7 +165,9 @@ def linear_bridge():
     mean, variance = 0.3 * decay + 0.2 * (1 - decay) / rate, 0.81 * (1 - decay**2) / (2 * rate)
     guide = nb.FrozenGuide(nb.LinearSDE(-rate, 0.4, 0.2))
     condition = nb.InexactMatch(0.04).at([1.1])
-    bridge = nb.GuidedBridge(nb.LinearSDE(-rate, 0.9, 0.2), condition, x0=[0.3], t1=1.0, num_steps=3, guide=guide)
+    bridge = nb.GuidedBridge(
+        nb.LinearSDE(-rate, 0.9, 0.2), condition, x0=[0.3], t1=1.0, num_steps=3, guide=guide
+    )
     return bridge, scipy.stats.norm.logpdf(1.1, mean, math.sqrt(variance + 0.04))
 
 
@@ -160,7 +175,9 @@ def geometric_bridge():
     """Noise that grows with the state, and an auxiliary process that does not know it."""
     ts, condition = np.linspace(0, 1, 5), nb.InexactMatch(0.02).at([1.5])
     sde = nb.SDE(lambda t, x, args: 0.1 * x, lambda t, x, args: 0.4 * x)
-    bridge = nb.GuidedBridge(sde, condition, x0=[1.0], ts=ts, guide=nb.FrozenGuide(nb.BrownianMotion(0.04)))
+    bridge = nb.GuidedBridge(
+        sde, condition, x0=[1.0], ts=ts, guide=nb.FrozenGuide(nb.BrownianMotion(0.04))
+    )
     return bridge, geometric_evidence(ts, 1.5, 0.02)
 
 
@@ -171,7 +188,9 @@ def test_bridges_of_a_poor_guide_cover(make):
 
     @jax.jit
     def log_weights(key):
-        return jax.vmap(jax.vmap(bridge.log_weight))(jr.normal(key, (300, 1024, *bridge.noise_shape)))
+        return jax.vmap(jax.vmap(bridge.log_weight))(
+            jr.normal(key, (300, 1024, *bridge.noise_shape))
+        )
 
     drawn = log_weights(jr.key(1))
     for size in (256, 1024):

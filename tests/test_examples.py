@@ -23,7 +23,12 @@ ENVIRONMENT = os.environ | {
 
 def run(*command, cwd):
     done = subprocess.run(
-        [sys.executable, *command], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=600
+        [sys.executable, *command],
+        cwd=cwd,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -38,7 +43,9 @@ def require_written(folder, *names):
 def test_first_page(tmp_path):
     pytest.importorskip("ktch")
     page = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S).group(1)
-    shorter = page.replace("num_warmup=500, num_samples=500", "num_warmup=1, num_samples=1, progress_bar=False")
+    shorter = page.replace(
+        "num_warmup=500, num_samples=500", "num_warmup=1, num_samples=1, progress_bar=False"
+    )
     shorter = shorter.replace("num_particles=4096", "num_particles=256")
     assert shorter != page
     (tmp_path / "page.py").write_text(
@@ -49,14 +56,21 @@ def test_first_page(tmp_path):
         run("page.py", cwd=tmp_path).replace("(", "").replace(")", "").split()
     )
     assert [int(n.rstrip(",")) for n in shape] == [51, 32, 2]
-    assert 100 < float(log_evidence) < 300 and float(error) < 0.2 and float(ess) > 50 and float(k) < 0.7
+    assert (
+        100 < float(log_evidence) < 300
+        and float(error) < 0.2
+        and float(ess) > 50
+        and float(k) < 0.7
+    )
     assert abs(float(log_weight) - float(log_evidence)) < 10
 
 
 def test_mosquito_wings(tmp_path):
     pytest.importorskip("ktch")
     pytest.importorskip("matplotlib")
-    out = run(str(ROOT / "examples/mosquito_wings.py"), "--quick", "--output", "output", cwd=tmp_path)
+    out = run(
+        str(ROOT / "examples/mosquito_wings.py"), "--quick", "--output", "output", cwd=tmp_path
+    )
     assert "r_hat" in out and "divergences: 0" in out
     require_written(tmp_path, "wings.nc", "bridges.png", "posterior.png", "score.png")
 
@@ -65,15 +79,22 @@ def test_phylogeny_reads_files(tmp_path):
     """Three species, one of a single specimen, a point that is missing, and a tip without a shape."""
     pytest.importorskip("matplotlib")
     rng = np.random.default_rng(0)
-    ellipses = dict(zip("abc", nb.datasets.ellipses(num_points=10, aspects=(1.0, 1.2, 1.5)).points, strict=True))
+    ellipses = dict(
+        zip("abc", nb.datasets.ellipses(num_points=10, aspects=(1.0, 1.2, 1.5)).points, strict=True)
+    )
     shapes = [ellipses[name] + 0.02 * rng.normal(size=(10, 2)) for name in "aabbc"]
     shapes[3][7] = np.nan
-    nb.io.write_tps(tmp_path / "shapes.tps", [nb.io.Specimen(shape, id=str(i)) for i, shape in enumerate(shapes)])
+    nb.io.write_tps(
+        tmp_path / "shapes.tps",
+        [nb.io.Specimen(shape, id=str(i)) for i, shape in enumerate(shapes)],
+    )
     (tmp_path / "table.csv").write_text("tip\n" + "\n".join("aabbc"))
     (tmp_path / "tree.nwk").write_text("(((a:1,b:1)ab:1,c:2):0.5,d:2.5);")
     chosen = "--shapes shapes.tps --table table.csv --names tip --tree tree.nwk --quick --output output".split()
     out = run(str(ROOT / "examples/phylogeny.py"), *chosen, cwd=tmp_path)
-    assert "tips without shapes, left out: d" in out and "5 specimens of 3 species, 10 points" in out
+    assert (
+        "tips without shapes, left out: d" in out and "5 specimens of 3 species, 10 points" in out
+    )
     assert "r_hat" in out and "divergences: 0" in out and "ancestors: 40 coordinates" in out
     require_written(tmp_path, "phylogeny.nc", "phylogeny_ladder.png", "phylogeny_posterior.png")
 
@@ -110,7 +131,9 @@ for names in ("shapes.csv tree.nwk", "named.csv tree.nwk", "no.csv tree.nwk", "n
 def test_phylogeny_prepares_data_and_says_what_is_wrong(tmp_path):
     pytest.importorskip("matplotlib")
     command = [sys.executable, "-c", PREPARED, str(ROOT / "examples")]
-    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=600
+    )
     assert done.returncode == 0, done.stderr
     said = [line for line in done.stderr.splitlines() if "error:" in line]
     assert len(said) == 4 and done.stderr.split().count("2") == 4
@@ -123,9 +146,17 @@ def test_phylogeny_prepares_data_and_says_what_is_wrong(tmp_path):
 def test_mosquito_tree(tmp_path):
     pytest.importorskip("ktch")
     pytest.importorskip("matplotlib")
-    out = run(str(ROOT / "examples/mosquito_tree.py"), "--quick", "--output", "output", cwd=tmp_path)
-    assert "126 specimens of 11 species, 16 points" in out and "r_hat" in out and "ancestors: 320 coordinates" in out
-    require_written(tmp_path, "mosquito_tree.nc", "mosquito_tree_ladder.png", "mosquito_tree_posterior.png")
+    out = run(
+        str(ROOT / "examples/mosquito_tree.py"), "--quick", "--output", "output", cwd=tmp_path
+    )
+    assert (
+        "126 specimens of 11 species, 16 points" in out
+        and "r_hat" in out
+        and "ancestors: 320 coordinates" in out
+    )
+    require_written(
+        tmp_path, "mosquito_tree.nc", "mosquito_tree_ladder.png", "mosquito_tree_posterior.png"
+    )
 
 
 @pytest.mark.slow
@@ -157,7 +188,9 @@ def test_learned_vs_guided(tmp_path):
         joint = (row["standard_error"] ** 2 + rows["guided"]["standard_error"] ** 2) ** 0.5
         assert abs(row["log_evidence"] - rows["guided"]["log_evidence"]) < 4 * joint + 1e-3, row
     # A check that all runs: so few draws have Monte Carlo errors that are themselves badly known.
-    assert all(abs(z) < 6 for row in found["difference_in_errors"].values() for z in row.values()), found
+    assert all(
+        abs(z) < 6 for row in found["difference_in_errors"].values() for z in row.values()
+    ), found
     require_written(tmp_path, "training.png", "comparison.png", "posteriors.png")
 
 
@@ -178,7 +211,9 @@ def test_conditioning_paper_reads_files(tmp_path):
     nb.io.write_csv(tmp_path / "start.csv", [nb.io.Specimen(ellipses.points[0])])
     nb.io.write_tps(tmp_path / "end.tps", [nb.io.Specimen(ellipses.points[1])])
     chosen = "--quick --figures outline --start start.csv --end end.tps --output output".split()
-    assert "RMS displacement" in run(str(ROOT / "examples/conditioning_paper.py"), *chosen, cwd=tmp_path)
+    assert "RMS displacement" in run(
+        str(ROOT / "examples/conditioning_paper.py"), *chosen, cwd=tmp_path
+    )
 
 
 def test_calibration(tmp_path):
@@ -195,7 +230,10 @@ def test_calibration(tmp_path):
 @pytest.mark.slow
 def test_mcmc_benchmark(tmp_path):
     out = run(str(ROOT / "benchmarks/mcmc.py"), "--quick", cwd=tmp_path)
-    assert [json.loads(line)["kernel"] for line in out.splitlines()] == ["gibbs-pcn-nuts", "function-space-hmc"]
+    assert [json.loads(line)["kernel"] for line in out.splitlines()] == [
+        "gibbs-pcn-nuts",
+        "function-space-hmc",
+    ]
 
 
 @pytest.mark.slow
@@ -208,7 +246,9 @@ def test_guided_weight_benchmark(tmp_path):
 def test_score_table_benchmark(tmp_path):
     """A small version: two landmarks, 20 updates of ours, from nothing."""
     pytest.importorskip("matplotlib")
-    out = run(str(ROOT / "benchmarks/score_table.py"), "--quick", "--output", "output", cwd=tmp_path)
+    out = run(
+        str(ROOT / "benchmarks/score_table.py"), "--quick", "--output", "output", cwd=tmp_path
+    )
     (row,) = [json.loads(line) for line in out.splitlines()]
     assert row["error"] < 1 and row["reference"]["steps_per_second"] > 0, row
     assert (tmp_path / "output" / "score_table.png").stat().st_size > 5000

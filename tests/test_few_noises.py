@@ -51,7 +51,10 @@ def seen(match):
 
 
 def normal_log_density(r, S):
-    return -0.5 * np.sum(r * np.linalg.solve(S, r)) - 0.5 * r.shape[1] * np.linalg.slogdet(2 * np.pi * S)[1]
+    return (
+        -0.5 * np.sum(r * np.linalg.solve(S, r))
+        - 0.5 * r.shape[1] * np.linalg.slogdet(2 * np.pi * S)[1]
+    )
 
 
 @pytest.mark.parametrize("end_weight", [0.0, 0.3])
@@ -84,7 +87,9 @@ def test_weight_is_that_of_dense_normals(name, end_weight, key):
             break
         u = np.linalg.lstsq(np.sqrt(dt) * sigmas[k], path[k + 1] - path[k], rcond=None)[0]
         law = np.eye(8) - A.T @ np.linalg.solve(S, A)
-        right += normal_log_density(u, np.eye(8)) - normal_log_density(u - A.T @ np.linalg.solve(S, r), law)
+        right += normal_log_density(u, np.eye(8)) - normal_log_density(
+            u - A.T @ np.linalg.solve(S, r), law
+        )
     np.testing.assert_allclose(found, right, rtol=1e-9, atol=1e-7)
 
 
@@ -112,18 +117,28 @@ def test_message_of_few_noises_is_dense(monkeypatch):
 def test_all_controls_are_landmark_noise():
     """One mechanism, up to rounding, whatever their order."""
     z = jr.normal(jr.key(0), (NUM_STEPS, N, 2))
-    by = [bridge(MATCHES["all"], None, noise).log_weight(z) for noise in (nb.LandmarkNoise(), nb.ControlNoise(N))]
+    by = [
+        bridge(MATCHES["all"], None, noise).log_weight(z)
+        for noise in (nb.LandmarkNoise(), nb.ControlNoise(N))
+    ]
     np.testing.assert_allclose(*by, rtol=1e-9)
 
 
 def test_evidence_is_that_of_all_landmarks():
-    """Within 3 joint standard errors, where what is missing, a(x, x)/10⁵, is little beside the errors, a(x, x)/80."""
+    """Within 3 joint standard errors, where what is missing, a(x, x)/10⁵, is little beside the
+    errors, a(x, x)/80.
+    """
     found = []
     for noise in (nb.LandmarkNoise(), nb.ControlNoise.within(1e-5, X0, KERNEL)):
         b = nb.GuidedBridge(flow(noise), MATCHES["all"].at(V), x0=X0, t1=1.0, num_steps=15)
         z = jr.normal(jr.key(1), (600, *b.noise_shape))
         w = jax.jit(jax.vmap(b.log_weight))(z)
-        found.append((logsumexp(w) - np.log(600), np.std(np.exp(w - np.max(w))) / np.mean(np.exp(w - np.max(w)))))
+        found.append(
+            (
+                logsumexp(w) - np.log(600),
+                np.std(np.exp(w - np.max(w))) / np.mean(np.exp(w - np.max(w))),
+            )
+        )
     assert b.noise_shape[1] <= N / 2
     (all_landmarks, spread), (control, other) = found
     assert abs(all_landmarks - control) < 3 * np.hypot(spread, other) / np.sqrt(600)
@@ -131,7 +146,9 @@ def test_evidence_is_that_of_all_landmarks():
 
 
 def test_missing_variance():
-    """1 − |σ_i|²/a(x, x) of a Gaussian field given its values at the controls, in NumPy; of the worst of two states."""
+    """1 − |σ_i|²/a(x, x) of a Gaussian field given its values at the controls, in NumPy; of the
+    worst of two states.
+    """
     c = np.array([0, 5, 11, 17])
     path = np.stack([X0, V])
     sde = flow(nb.ControlNoise(points=c))
@@ -147,7 +164,9 @@ def test_missing_variance():
 
 
 def test_controls_are_apart_and_known_by_the_start():
-    """Far points in turn: of four clusters one of each; chosen in a traced program too, and not moved by a path."""
+    """Far points in turn: of four clusters one of each; chosen in a traced program too, and not
+    moved by a path.
+    """
     clusters = np.array([[0, 0], [4, 0], [0, 4], [4, 4.0]])
     x = (clusters[:, None] + 0.1 * np.random.default_rng(0).normal(size=(4, 3, 2))).reshape(12, 2)
     sde = flow(nb.ControlNoise(4), n=12, kernel=nb.GaussianKernel(0.3, 4.0))
@@ -158,15 +177,21 @@ def test_controls_are_apart_and_known_by_the_start():
 
 
 def test_default_noise():
-    """All landmarks up to 64, controls of more; half of the variance missing is seen, not computed with."""
+    """All landmarks up to 64, controls of more; half of the variance missing is seen, not computed
+    with.
+    """
     assert isinstance(flow(None).noise_field, nb.LandmarkNoise)
     assert isinstance(flow(None, n=65).noise_field, nb.ControlNoise)
     s = np.linspace(0, 2 * np.pi, 80, endpoint=False)
     x = np.stack([np.cos(s), np.sin(s)], 1)
 
     def weight(length_scale):
-        sde = nb.KunitaFlow(nb.Landmarks(80, 2), nb.GaussianKernel(0.3, length_scale), noise=nb.ControlNoise(16))
-        return nb.GuidedBridge(sde, MATCHES["all"].at(x), x0=x, t1=1.0, num_steps=3).log_weight(jnp.zeros((3, 16, 2)))
+        sde = nb.KunitaFlow(
+            nb.Landmarks(80, 2), nb.GaussianKernel(0.3, length_scale), noise=nb.ControlNoise(16)
+        )
+        return nb.GuidedBridge(sde, MATCHES["all"].at(x), x0=x, t1=1.0, num_steps=3).log_weight(
+            jnp.zeros((3, 16, 2))
+        )
 
     values = jax.jit(jax.vmap(weight))(jnp.array([0.5, 0.05]))
     assert np.isfinite(values[0]) and np.isnan(values[1])
@@ -179,16 +204,35 @@ def test_default_noise():
         (lambda: nb.ControlNoise(3, points=[0, 1]), "`num_points` or `points`, not both"),
         (lambda: nb.ControlNoise(points=[0, 0, 2]), "`points` must be different indices"),
         (lambda: nb.ControlNoise(points=[-1, 2]), "`points` must be different indices"),
-        (lambda: bridge(MATCHES["all"], None, nb.ControlNoise(N + 1)), "`num_points` of `ControlNoise` .*24; got 25"),
-        (lambda: bridge(MATCHES["all"], None, nb.ControlNoise(points=[2, N])), "`points` .*below 24; got 24"),
-        (lambda: bridge(MATCHES["all"], None, nb.ControlNoise(3)), "`x0` does not fit the noise.*`ControlNoise"),
-        (lambda: nb.ControlNoise.within(1e-6, X0, SHORT, max_points=5), "`tolerance` must be .*5 controls"),
+        (
+            lambda: bridge(MATCHES["all"], None, nb.ControlNoise(N + 1)),
+            "`num_points` of `ControlNoise` .*24; got 25",
+        ),
+        (
+            lambda: bridge(MATCHES["all"], None, nb.ControlNoise(points=[2, N])),
+            "`points` .*below 24; got 24",
+        ),
+        (
+            lambda: bridge(MATCHES["all"], None, nb.ControlNoise(3)),
+            "`x0` does not fit the noise.*`ControlNoise",
+        ),
+        (
+            lambda: nb.ControlNoise.within(1e-6, X0, SHORT, max_points=5),
+            "`tolerance` must be .*5 controls",
+        ),
         (lambda: nb.ControlNoise.within(2.0, X0, KERNEL), "`tolerance` must be between 0 and 1"),
         (lambda: nb.ControlNoise.within(1e-3, X0), "either `kernel` or `covariance`"),
-        (lambda: nb.KunitaFlow(nb.FourierBasis(2, 2), KERNEL, noise="control"), '`noise="control"`.*`FourierBasis`'),
+        (
+            lambda: nb.KunitaFlow(nb.FourierBasis(2, 2), KERNEL, noise="control"),
+            '`noise="control"`.*`FourierBasis`',
+        ),
         (
             lambda: nb.GuidedBridge(
-                flow(nb.ControlNoise(points=[1, 2])), MATCHES["all"].at(V), x0=DOUBLE, t1=1.0, num_steps=2
+                flow(nb.ControlNoise(points=[1, 2])),
+                MATCHES["all"].at(V),
+                x0=DOUBLE,
+                t1=1.0,
+                num_steps=2,
             ),
             "`x0` must have distinct landmarks; 1 and 2 coincide",
         ),
@@ -203,7 +247,9 @@ def test_bad_controls(wrong, message):
 
 
 def test_what_is_told_of_a_node_by_few_noises():
-    """In noise coordinates, x = σ α: the pruning of standard Brownian motion, by NumPy, with masks and own errors."""
+    """In noise coordinates, x = σ α: the pruning of standard Brownian motion, by NumPy, with masks
+    and own errors.
+    """
     rng = np.random.default_rng(0)
     sigma, times = rng.normal(size=(9, 3)), (0.4, 0.7)
     masks, variances = (np.arange(9) != 2, np.arange(9) < 7), (0.1, 0.3)
@@ -211,8 +257,14 @@ def test_what_is_told_of_a_node_by_few_noises():
     part = told.Part.of(jnp.asarray(sigma), jnp.asarray(sigma @ sigma.T))
     H, f, at_node = 0.0, 0.0, []
     for v, t, mask, variance in zip(data, times, masks, variances, strict=True):
-        seen = nb.InexactMatch(variance, mask=mask).observation(nb.BrownianMotion(1.0), jnp.asarray(v))
-        at_node.append(told.told_by(part.seen(seen), mask[:, None] * v, jnp.asarray(t), part.a, part.of_state(v)))
+        seen = nb.InexactMatch(variance, mask=mask).observation(
+            nb.BrownianMotion(1.0), jnp.asarray(v)
+        )
+        at_node.append(
+            told.told_by(
+                part.seen(seen), mask[:, None] * v, jnp.asarray(t), part.a, part.of_state(v)
+            )
+        )
         S = variance * np.eye(mask.sum()) + t * sigma[mask] @ sigma[mask].T
         H = H + sigma[mask].T @ np.linalg.solve(S, sigma[mask])
         f = f + sigma[mask].T @ np.linalg.solve(S, v[mask])
@@ -227,7 +279,9 @@ def test_what_is_told_of_a_node_by_few_noises():
     S = np.asarray(seen.factor) @ np.asarray(seen.factor).T + kappa * R @ R.T
     assert kappa > 0 and known.operator.shape == (3, 9)
     np.testing.assert_allclose(R.T @ np.linalg.solve(S, R), H, rtol=1e-7)
-    np.testing.assert_allclose(np.asarray(known.operator) @ part.lifted(reference), value, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.asarray(known.operator) @ part.lifted(reference), value, rtol=1e-9
+    )
 
 
 def test_tree_of_few_noises(key):
@@ -250,7 +304,9 @@ def test_tree_of_few_noises(key):
 
 @pytest.mark.slow  # as of a tree of all noises, which runs always
 def test_priors_on_everything_in_both_precisions():
-    """Kernel, jitter, errors, lengths, start and guide, on a tree, inside a model under jit: float32 within 0.02."""
+    """Kernel, jitter, errors, lengths, start and guide, on a tree, inside a model under jit:
+    float32 within 0.02.
+    """
     data = np.stack([V, 0.95 * V, 1.05 * X0])
 
     def everything(data):
@@ -264,10 +320,18 @@ def test_priors_on_everything_in_both_precisions():
         guide = nb.GeodesicGuide(correction, numpyro.sample("end_weight", dist.Uniform(0.0, 0.5)))
         sde = flow(noise, kernel=nb.GaussianKernel(amplitude, length_scale))
         tree = nb.Tree.from_newick("((a:.4,b:.5):.5,c:.6);").scaled(rates)
-        law = nb.DiffusionTree(sde, start, nb.InexactMatch(variance), tree=tree, num_steps=2, guide=guide)
+        law = nb.DiffusionTree(
+            sde, start, nb.InexactMatch(variance), tree=tree, num_steps=2, guide=guide
+        )
         nb.sample("tips", law, obs=data)
 
-    values = {"amplitude": 0.3, "length_scale": 1.2, "jitter": 1e-3, "variance": 0.05, "start": X0 + 0.01}
+    values = {
+        "amplitude": 0.3,
+        "length_scale": 1.2,
+        "jitter": 1e-3,
+        "variance": 0.05,
+        "start": X0 + 0.01,
+    }
     values |= {"rates": np.linspace(0.8, 1.2, 4), "correction": 0.6, "end_weight": 0.1}
     values |= {"tips_noise": np.random.default_rng(0).normal(size=(8, 8, 2))}
 
@@ -283,14 +347,18 @@ def test_priors_on_everything_in_both_precisions():
     for name in values:
         largest = np.max(np.abs(slopes[name]))
         assert largest > 0
-        np.testing.assert_allclose(single_slopes[name], slopes[name], rtol=0, atol=2e-3 * largest, err_msg=name)
+        np.testing.assert_allclose(
+            single_slopes[name], slopes[name], rtol=0, atol=2e-3 * largest, err_msg=name
+        )
 
 
 # Brownian motion of a smooth field: as many noises as it has directions.
 
 
 def test_a_smooth_covariance_on_many_points(key):
-    """256 points, a length scale of 64 of them: singular to the last digit; by SciPy's dense normal."""
+    """256 points, a length scale of 64 of them: singular to the last digit; by SciPy's dense
+    normal.
+    """
     s = np.linspace(0, 4, 256)
     Q = np.exp(-((s[:, None] - s[None]) ** 2) / 2)
     x0, v = np.sin(s), np.cos(s)
@@ -301,7 +369,9 @@ def test_a_smooth_covariance_on_many_points(key):
         bridge = nb.GuidedBridge(sde, nb.InexactMatch(0.01).at(v), x0=x0, t1=0.7, num_steps=3)
         weight = bridge.log_weight(jr.normal(key, bridge.noise_shape))
         np.testing.assert_allclose(weight, expected, rtol=1e-8)
-    assert nb.BrownianMotion([1.0, 0.0]).factor is None and nb.BrownianMotion(np.ones((3, 3))).factor.shape == (3, 1)
+    assert nb.BrownianMotion([1.0, 0.0]).factor is None and nb.BrownianMotion(
+        np.ones((3, 3))
+    ).factor.shape == (3, 1)
 
 
 def test_a_factor_may_be_traced():
@@ -310,7 +380,9 @@ def test_a_factor_may_be_traced():
 
     def log_density(scale):
         walk = nb.BrownianMotion(factor=scale * F)
-        bridge = nb.GuidedBridge(walk, nb.InexactMatch(0.1).at(v), x0=np.zeros(3), t1=1.0, num_steps=2)
+        bridge = nb.GuidedBridge(
+            walk, nb.InexactMatch(0.1).at(v), x0=np.zeros(3), t1=1.0, num_steps=2
+        )
         return bridge.log_weight(jnp.ones(bridge.noise_shape))
 
     value, slope = jax.jit(jax.value_and_grad(log_density))(1.3)
@@ -341,16 +413,23 @@ def carried(name, num_steps=12):
 
 @pytest.mark.parametrize("name", NOISES)
 def test_carry(name):
-    """The landmarks move as they do; there and back is where one was; the map is smooth and keeps its orientation."""
+    """The landmarks move as they do; there and back is where one was; the map is smooth and keeps
+    its orientation.
+    """
     sde, path, points = carried(name)
     np.testing.assert_allclose(sde.carry(path, X0), path, atol=1e-12)
-    np.testing.assert_allclose(sde.carry(path, X0 + 1e-7), path, atol=1e-4)  # beside them the jitter is not
+    # beside them the jitter is not
+    np.testing.assert_allclose(sde.carry(path, X0 + 1e-7), path, atol=1e-4)
     there = sde.carry(path, points)
     np.testing.assert_allclose(sde.carry(path, there[-1], inverse=True), there, atol=1e-10)
     slopes = jax.jit(jax.vmap(jax.jacfwd(lambda p: sde.carry(path, p[None])[-1, 0])))(points)
     stretched = sde.jacobian(path, points)
     np.testing.assert_allclose(stretched[-1], np.linalg.det(slopes), rtol=1e-6)
-    assert np.all(stretched[0] == 1) and np.all(stretched > 0) and np.max(np.abs(there[-1] - points)) > 0.05
+    assert (
+        np.all(stretched[0] == 1)
+        and np.all(stretched > 0)
+        and np.max(np.abs(there[-1] - points)) > 0.05
+    )
     step = 1e-5
     moved = sde.carry(path, points + np.array([step, 0.0]))[-1]
     np.testing.assert_allclose((moved - there[-1]) / step, slopes[..., 0], rtol=2e-3, atol=2e-3)
@@ -363,7 +442,9 @@ def test_carry_is_kriging():
     c = path[0][index]
 
     def a(p, q):
-        return np.exp(-np.sum((np.asarray(p)[:, None] - np.asarray(q)[None]) ** 2, -1) / (4 * 0.9**2))
+        return np.exp(
+            -np.sum((np.asarray(p)[:, None] - np.asarray(q)[None]) ** 2, -1) / (4 * 0.9**2)
+        )
 
     move = a(points, c) @ np.linalg.solve(a(c, c), np.asarray(path[1] - path[0])[index])
     np.testing.assert_allclose(sde.carry(path, points)[-1], points + move, atol=1e-6)
@@ -372,7 +453,10 @@ def test_carry_is_kriging():
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        (lambda: flow(None).carry(X0, X0), r"`path` must have shape \(K \+ 1, 24, 2\); got \(24, 2\)"),
+        (
+            lambda: flow(None).carry(X0, X0),
+            r"`path` must have shape \(K \+ 1, 24, 2\); got \(24, 2\)",
+        ),
         (lambda: flow(None).carry(np.stack([X0, V]), X0[0]), r"`points` must have shape \(q, 2\)"),
         (lambda: flow(None).carry(np.stack([X0, V]), X0, inverse=1), "`inverse` must be"),
     ],

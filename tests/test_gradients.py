@@ -53,13 +53,17 @@ def test_phi_of_every_order(order, dtype):
         f = slope(f)
     found = jax.jit(f)(jnp.asarray(x, dtype))
     exactly = {"epsabs": 0, "epsrel": 1e-13}
-    integrals = [scipy.integrate.quad(lambda s, y=y: s**order * np.exp(s * y), 0, 1, **exactly) for y in x]
+    integrals = [
+        scipy.integrate.quad(lambda s, y=y: s**order * np.exp(s * y), 0, 1, **exactly) for y in x
+    ]
     truth = [value for value, _ in integrals]
     np.testing.assert_allclose(found, truth, rtol=1000 * np.finfo(dtype).eps)
 
 
 def test_a_root_at_zero():
-    """Its derivative there is that of |y|, the mean of both sides; below 0 it is NaN, as it should be."""
+    """Its derivative there is that of |y|, the mean of both sides; below 0 it is NaN, as it should
+    be.
+    """
     assert jax.grad(safe_sqrt)(0.0) == 0 and jax.jvp(safe_sqrt, (0.0,), (1.0,)) == (0, 0)
     assert jax.grad(lambda y: safe_sqrt(y * y))(0.0) == 0
     np.testing.assert_allclose(jax.grad(safe_sqrt)(2.0), 0.5 / np.sqrt(2), rtol=1e-15)
@@ -132,7 +136,9 @@ def grid(p):
 
 def sum_of_kernels(p):
     rough = p["factor"] * nb.MaternKernel(p["amplitude"], 0.7, order=1)
-    return nb.KunitaFlow(nb.Landmarks(3, 2), covariance=rough + nb.GaussianKernel(0.2, p["length_scale"]))
+    return nb.KunitaFlow(
+        nb.Landmarks(3, 2), covariance=rough + nb.GaussianKernel(0.2, p["length_scale"])
+    )
 
 
 def quadrature(p):
@@ -235,25 +241,46 @@ WIDE = {"length_scale": 0.9, "period": 9.5}
 CURVE = {"x0": 0.4 * TRIANGLE[:, :1], "observed": 0.4 * TRIANGLE[:, 1:]}
 BOX = {"length_scale": 0.5, "lower": -4.0}
 MIXED = {"factor": 0.5, "length_scale": 0.9, "end_weight": 0.2}
-CELLS = {"x0": np.array([[0.2], [1.0], [-0.6]]), "lower": -4.0}  # two of them are midpoints of cells
+# two of them are midpoints of cells
+CELLS = {"x0": np.array([[0.2], [1.0], [-0.6]]), "lower": -4.0}
 MEETING = {"x0": np.array([[0.2], [0.2], [-0.6]]), "lower": -4.0}
 CLOCK = {"x0": PLAIN["x0"], "observed": PLAIN["observed"], "variance": 0.1, "drift": -0.5}
 FIELD = {"diffusivity": 0.2, "diffusion": 0.4, "rate": 0.7}
-SQUARE = {"x0": np.linspace(-0.1, 0.2, 81), "observed": 0.1 * np.cos(np.arange(81)), "t1": 1.2, "variance": 0.1}
+SQUARE = {
+    "x0": np.linspace(-0.1, 0.2, 81),
+    "observed": 0.1 * np.cos(np.arange(81)),
+    "t1": 1.2,
+    "variance": 0.1,
+}
 PIN = {"x0": PLAIN["x0"], "t1": 1.2, "pin": 0.4, "lower": -0.2, "upper": 0.5}
 RANK_ONE = {"drift": B, "diffusion": B[:, 1:], "operator": np.array([[1.0, 0.5], [0.0, 1.0]])}
 
-OUTLINE = {"x0": TRIANGLE, "observed": np.array([[1.0, 0.1], [0.2, 1.2], [-0.7, -0.6]]), "t1": 1.2, "variance": 0.1}
+OUTLINE = {
+    "x0": TRIANGLE,
+    "observed": np.array([[1.0, 0.1], [0.2, 1.2], [-0.7, -0.6]]),
+    "t1": 1.2,
+    "variance": 0.1,
+}
 
 CASES = {
     "no rate": (linear, inexact, no_guide, PLAIN | RATE | {"shift": np.array([1.0, 0.2])}),
     "no rate, no noise": (linear, inexact, no_guide, PLAIN | DIAGONAL),
     "opposite rates": (linear, inexact, no_guide, PLAIN | OPPOSITE),
-    "no matrix of rates": (linear, inexact, no_guide, PLAIN | {"drift": np.zeros((2, 2)), "diffusion": MATRIX}),
+    "no matrix of rates": (
+        linear,
+        inexact,
+        no_guide,
+        PLAIN | {"drift": np.zeros((2, 2)), "diffusion": MATRIX},
+    ),
     "rank one": (linear, inexact, no_guide, PLAIN | RANK_ONE),
     "learned": (user, inexact, learned, PLAIN | DIAGONAL | {"network": 0.3}),
     "semilinear": (semilinear(nb.CosineBasis(1, 1)), inexact, no_guide, PLAIN | FIELD),
-    "semilinear, along a path": (semilinear(nb.SineBasis(2, 1)), inexact, along_a_path, PLAIN | FIELD),
+    "semilinear, along a path": (
+        semilinear(nb.SineBasis(2, 1)),
+        inexact,
+        along_a_path,
+        PLAIN | FIELD,
+    ),
     "semilinear, diagonal": (semilinear(nb.FourierSquare(4, 1)), inexact, no_guide, FIELD | SQUARE),
     "covariance": (brownian, inexact, no_guide, PLAIN | {"Q": MATRIX, "variance": 0.1 * MATRIX}),
     "exact": (linear, exact, unguided, FEW | RATE),
@@ -267,10 +294,25 @@ CASES = {
     "times": (clocked, inexact, no_guide, CLOCK | {"ts": np.array([0.4, 1.0, 1.3])}),
     "interval": (clocked, inexact, no_guide, CLOCK | {"t0": 0.4, "t1": 1.3}),
     "bins": (linear, bins, no_guide, FEW | RATE | CUTS),
-    "geodesic": (flow, inexact, geodesic, SHAPES | {"length_scale": 0.9, "end_weight": 0.1, "correction": 0.75}),
-    "geodesic, straight": (flow, inexact, geodesic, SHAPES | STILL | {"end_weight": 0.0, "correction": 1.0}),
+    "geodesic": (
+        flow,
+        inexact,
+        geodesic,
+        SHAPES | {"length_scale": 0.9, "end_weight": 0.1, "correction": 0.75},
+    ),
+    "geodesic, straight": (
+        flow,
+        inexact,
+        geodesic,
+        SHAPES | STILL | {"end_weight": 0.0, "correction": 1.0},
+    ),
     "flow": (flow, inexact, receding, SHAPES | {"length_scale": 0.9, "end_weight": 0.0}),
-    "controls": (controls, inexact, geodesic, SHAPES | FAR | {"end_weight": 0.0, "correction": 0.75}),
+    "controls": (
+        controls,
+        inexact,
+        geodesic,
+        SHAPES | FAR | {"end_weight": 0.0, "correction": 0.75},
+    ),
     "no jitter": (jittered, inexact, receding, SHAPES | JITTER | {"end_weight": 1.0}),
     "sum of kernels": (sum_of_kernels, inexact, receding, SHAPES | MIXED),
     "quadrature": (quadrature, inexact, no_guide, SHAPES | CURVE | CELLS | {"length_scale": 0.8}),
@@ -285,7 +327,9 @@ def bridge_of(name, p):
     sde, condition, guide, _ = CASES[name]
     times = {name: p[name] for name in ("t0", "t1", "ts") if name in p}
     num_steps = None if "ts" in p else 2
-    return nb.GuidedBridge(sde(p), condition(p), x0=p["x0"], num_steps=num_steps, guide=guide(p), **times)
+    return nb.GuidedBridge(
+        sde(p), condition(p), x0=p["x0"], num_steps=num_steps, guide=guide(p), **times
+    )
 
 
 def test_every_public_class_has_a_case():

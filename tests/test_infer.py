@@ -1,4 +1,6 @@
-"""The MCMC kernels: exact, in NumPyro's contract, and with an acceptance that does not depend on the grid."""
+"""The MCMC kernels: exact, in NumPyro's contract, and with an acceptance that does not depend on
+the grid.
+"""
 
 import pickle
 
@@ -30,10 +32,14 @@ DATA = np.random.default_rng(0).normal(0.5, 0.5, (3, 2))
 
 
 def conjugate(data=None, n=3):
-    """Ornstein-Uhlenbeck processes with a common mean, guided by another process: the weights depend on the noise."""
+    """Ornstein-Uhlenbeck processes with a common mean, guided by another process: the weights
+    depend on the noise.
+    """
     mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
     sde, guide = nb.LinearSDE(-1.0, 0.6, mean), nb.FrozenGuide(nb.LinearSDE(0.0, 0.75, 0.3))
-    law = nb.DiffusionEndpoint(sde, np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4, guide=guide)
+    law = nb.DiffusionEndpoint(
+        sde, np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4, guide=guide
+    )
     with numpyro.plate("specimen", n):
         nb.sample("wing", law, obs=data)
 
@@ -49,13 +55,21 @@ def sine(data=None, n=None):
     """A nonlinear process in which every parameter matters, and a crude guide."""
     force = numpyro.sample("force", dist.Normal(1.0, 0.5))
     spread = numpyro.sample("spread", dist.LogNormal(-0.5, 0.4))
-    sde = nb.SDE(lambda t, x, a: a[0] * jnp.sin(2 * x), lambda t, x, a: a[1] * (1 + 0.3 * jnp.cos(x)), (force, spread))
-    law = nb.DiffusionEndpoint(sde, np.zeros(1), nb.InexactMatch(0.05), t1=1.0, num_steps=4, guide=nb.FrozenGuide())
+    sde = nb.SDE(
+        lambda t, x, a: a[0] * jnp.sin(2 * x),
+        lambda t, x, a: a[1] * (1 + 0.3 * jnp.cos(x)),
+        (force, spread),
+    )
+    law = nb.DiffusionEndpoint(
+        sde, np.zeros(1), nb.InexactMatch(0.05), t1=1.0, num_steps=4, guide=nb.FrozenGuide()
+    )
     nb.sample("v", law, obs=data)
 
 
 def with_nuts(kernel, **settings):
-    return lambda model: Gibbs([(kernel(model, **settings), noise_sites), (NUTS(model, step_size=0.3), None)])
+    return lambda model: Gibbs(
+        [(kernel(model, **settings), noise_sites), (NUTS(model, step_size=0.3), None)]
+    )
 
 
 KERNELS = {
@@ -84,13 +98,22 @@ def run(kernel, *args, num_warmup=300, num_samples=1000, num_chains=4, **setting
     return mcmc
 
 
-SOME = [pytest.param(name, marks=pytest.mark.slow if name in ("PCN", "pseudo-marginal-20") else ()) for name in KERNELS]
+SOME = [
+    pytest.param(name, marks=pytest.mark.slow if name in ("PCN", "pseudo-marginal-20") else ())
+    for name in KERNELS
+]
 
 
 @pytest.mark.parametrize("name", SOME)
 def test_conjugate_posterior(name):
     """Mean within 3 standard errors, which are below 0.02 posterior SD; SD within 3 %."""
-    draws = {"FunctionSpaceHMC": 4000, "PCN": 5000, "PCN-blocks": 5000, "PCNL": 5000, "MALA-2": 8000}.get(name, 16000)
+    draws = {
+        "FunctionSpaceHMC": 4000,
+        "PCN": 5000,
+        "PCN-blocks": 5000,
+        "PCNL": 5000,
+        "MALA-2": 8000,
+    }.get(name, 16000)
     mcmc = run(KERNELS[name](conjugate), DATA, num_samples=draws, extra_fields=("~z.wing_noise",))
     x = np.asarray(mcmc.get_samples(group_by_chain=True)["mean"])
     mean, sd = conjugate_posterior()
@@ -106,10 +129,18 @@ SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    "name", ["FunctionSpaceHMC", "PCN-blocks", pytest.param("PCNL", marks=SLOW), "pseudo-marginal-2", "MALA-2"]
+    "name",
+    [
+        "FunctionSpaceHMC",
+        "PCN-blocks",
+        pytest.param("PCNL", marks=SLOW),
+        "pseudo-marginal-2",
+        "MALA-2",
+    ],
 )
 def test_stays_in_the_joint_law(name):
-    """From exact draws of (θ, noise, data), some steps given the data leave (θ, noise, data) as they were.
+    """From exact draws of (θ, noise, data), some steps given the data leave (θ, noise, data) as
+    they were.
 
     (θ, v) is simulated forward, and the noise is that of the bridge to v along the simulated path.
     """
@@ -121,13 +152,19 @@ def test_stays_in_the_joint_law(name):
         trace = numpyro.handlers.trace(numpyro.handlers.seed(sine, key_prior)).get_trace()
         law = trace["v"]["fn"]
         v, noise = law.sample_with_noise(key_law)
-        start = {"force": trace["force"]["value"], "spread": jnp.log(trace["spread"]["value"]), "v_noise": noise}
+        start = {
+            "force": trace["force"]["value"],
+            "spread": jnp.log(trace["spread"]["value"]),
+            "v_noise": noise,
+        }
         state = kernel.init(key_chain, 0, start, (v,), {})
         if hasattr(state, "particles"):
             fresh = jr.normal(key_particles, state.particles["v_noise"][1:].shape)
             state = state._replace(particles={"v_noise": jnp.concatenate([noise[None], fresh])})
             state = kernel.refresh(state, (v,), {})
-        state, _ = jax.lax.scan(lambda state, _: (kernel.sample(state, (v,), {}), None), state, length=steps)
+        state, _ = jax.lax.scan(
+            lambda state, _: (kernel.sample(state, (v,), {}), None), state, length=steps
+        )
         return start, state.z, v
 
     before, after, v = jax.jit(jax.vmap(replicate))(jr.split(jr.key(1), number))
@@ -157,7 +194,9 @@ def test_stays_in_the_joint_law(name):
 
 def no_information(data=None):
     numpyro.sample("theta", dist.Gamma(3.0, 2.0))
-    law = nb.DiffusionEndpoint(nb.LinearSDE(-1.0, 0.6), np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4)
+    law = nb.DiffusionEndpoint(
+        nb.LinearSDE(-1.0, 0.6), np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4
+    )
     with numpyro.plate("specimen", 3):
         nb.sample("wing", law, obs=data)
 
@@ -165,7 +204,9 @@ def no_information(data=None):
 @pytest.mark.parametrize("name", ["FunctionSpaceHMC", "PCN", "pseudo-marginal-2"])
 def test_prior_where_the_weight_is_constant(name):
     draws = 12000 if name.startswith("pseudo") else 3000  # correlated particles forget slowly
-    samples = run(KERNELS[name](no_information), DATA, num_samples=draws).get_samples(group_by_chain=True)
+    samples = run(KERNELS[name](no_information), DATA, num_samples=draws).get_samples(
+        group_by_chain=True
+    )
     theta, noise = np.asarray(samples["theta"]), np.asarray(samples["wing_noise"])
     error = np.sqrt(0.75 / effective_sample_size(theta))
     assert abs(theta.mean() - 1.5) < 4 * error < 0.1
@@ -185,7 +226,9 @@ def flow_model(num_points, num_steps):
         nb.sample("shape", law, obs=data)
 
     angles = ANGLES(num_points)
-    return model, np.stack([1.2 * np.cos(angles), 0.8 * np.sin(angles) + 0.1 * np.cos(2 * angles)], 1)
+    return model, np.stack(
+        [1.2 * np.cos(angles), 0.8 * np.sin(angles) + 0.1 * np.cos(2 * angles)], 1
+    )
 
 
 def ANGLES(n):
@@ -203,7 +246,13 @@ def test_acceptance_does_not_depend_on_the_grid(kernel):
             chain = PCN(model, angle=0.8, adapt_angle=False)
         else:
             chain = FunctionSpaceHMC(model, step_size=1.0, adapt_step_size=False)
-        mcmc = run(chain, data, num_warmup=100, num_samples=600, extra_fields=("accept_prob", "~z.shape_noise"))
+        mcmc = run(
+            chain,
+            data,
+            num_warmup=100,
+            num_samples=600,
+            extra_fields=("accept_prob", "~z.shape_noise"),
+        )
         rates.append(float(np.mean(mcmc.get_extra_fields()["accept_prob"])))
     assert 0.3 < rates[0] < 0.99
     assert np.ptp(rates) < 0.03, rates
@@ -222,21 +271,63 @@ NOISE_ONLY = numpyro.handlers.condition(conjugate, {"mean": 0.3})
 REFUSED = {
     "model": (lambda: FunctionSpaceHMC(3), "`model` must be a NumPyro model"),
     "discrete": (lambda: FunctionSpaceHMC(discrete), r"cannot draw the discrete sites \['which'\]"),
-    "no noise": (lambda: FunctionSpaceHMC(no_noise), "found no driving noise among the latent sites"),
-    "step": (lambda: FunctionSpaceHMC(conjugate, step_size=0.0), "`step_size` must be positive and finite; got 0.0"),
-    "target": (lambda: FunctionSpaceHMC(conjugate, target_accept_prob=1.0), r"must be in \(0, 1\); got 1.0"),
-    "length": (lambda: FunctionSpaceHMC(conjugate, trajectory_length=-1.0), "`trajectory_length` must be positive"),
-    "jitter": (lambda: FunctionSpaceHMC(conjugate, jitter=1.0), r"`jitter` must be in \[0, 1\); got 1.0"),
-    "PCN with parameters": (lambda: PCN(conjugate), r"moves noise alone, and the model has parameters, \['mean'\]"),
+    "no noise": (
+        lambda: FunctionSpaceHMC(no_noise),
+        "found no driving noise among the latent sites",
+    ),
+    "step": (
+        lambda: FunctionSpaceHMC(conjugate, step_size=0.0),
+        "`step_size` must be positive and finite; got 0.0",
+    ),
+    "target": (
+        lambda: FunctionSpaceHMC(conjugate, target_accept_prob=1.0),
+        r"must be in \(0, 1\); got 1.0",
+    ),
+    "length": (
+        lambda: FunctionSpaceHMC(conjugate, trajectory_length=-1.0),
+        "`trajectory_length` must be positive",
+    ),
+    "jitter": (
+        lambda: FunctionSpaceHMC(conjugate, jitter=1.0),
+        r"`jitter` must be in \[0, 1\); got 1.0",
+    ),
+    "PCN with parameters": (
+        lambda: PCN(conjugate),
+        r"moves noise alone, and the model has parameters, \['mean'\]",
+    ),
     "angle": (lambda: PCN(NOISE_ONLY, angle=2.0), r"`angle` must be in \(0, π/2\]; got 2.0"),
-    "moves": (lambda: PCN(NOISE_ONLY, num_moves=0), "`num_moves` must be a positive integer; got 0"),
-    "blocks": (lambda: PCN(NOISE_ONLY, num_blocks=5), r"`num_blocks` must be at most the number of time steps"),
-    "no tree": (lambda: PCN(NOISE_ONLY, blocks="branch"), "`blocks` needs the noise of a `DiffusionTree`"),
-    "both cuts": (lambda: PCN(NOISE_ONLY, num_blocks=2, blocks="clade"), "`num_blocks` cuts time steps, and"),
-    "no cut": (lambda: PCN(NOISE_ONLY, blocks="tip"), "`blocks` must be one of 'branch', 'clade'; got 'tip'"),
-    "no parameters": (lambda: CorrelatedPseudoMarginal(NOISE_ONLY, 2), "the model has none but its noise"),
-    "particles": (lambda: CorrelatedPseudoMarginal(conjugate, 0), "`num_particles` must be a positive integer; got 0"),
-    "correlation": (lambda: CorrelatedPseudoMarginal(conjugate, 2, correlation=1.0), r"must be in \[0, 1\); got 1.0"),
+    "moves": (
+        lambda: PCN(NOISE_ONLY, num_moves=0),
+        "`num_moves` must be a positive integer; got 0",
+    ),
+    "blocks": (
+        lambda: PCN(NOISE_ONLY, num_blocks=5),
+        r"`num_blocks` must be at most the number of time steps",
+    ),
+    "no tree": (
+        lambda: PCN(NOISE_ONLY, blocks="branch"),
+        "`blocks` needs the noise of a `DiffusionTree`",
+    ),
+    "both cuts": (
+        lambda: PCN(NOISE_ONLY, num_blocks=2, blocks="clade"),
+        "`num_blocks` cuts time steps, and",
+    ),
+    "no cut": (
+        lambda: PCN(NOISE_ONLY, blocks="tip"),
+        "`blocks` must be one of 'branch', 'clade'; got 'tip'",
+    ),
+    "no parameters": (
+        lambda: CorrelatedPseudoMarginal(NOISE_ONLY, 2),
+        "the model has none but its noise",
+    ),
+    "particles": (
+        lambda: CorrelatedPseudoMarginal(conjugate, 0),
+        "`num_particles` must be a positive integer; got 0",
+    ),
+    "correlation": (
+        lambda: CorrelatedPseudoMarginal(conjugate, 2, correlation=1.0),
+        r"must be in \[0, 1\); got 1.0",
+    ),
 }
 
 
@@ -248,7 +339,10 @@ def test_refusals(case):
 
 
 def test_a_start_of_density_zero_is_refused():
-    with pytest.raises(ValueError, match="potential energy is (nan|inf|-inf) at the start: give other `init_params`"):
+    with pytest.raises(
+        ValueError,
+        match="potential energy is (nan|inf|-inf) at the start: give other `init_params`",
+    ):
         FunctionSpaceHMC(conjugate).init(jr.key(0), 10, {"mean": jnp.array(jnp.nan)}, (DATA,), {})
 
 
@@ -260,18 +354,26 @@ def test_sample_before_init_is_refused():
 
 
 def test_number_of_particles():
-    """The smallest by which the log estimate varies by at most 1.7; a warning where it cannot be had."""
+    """The smallest by which the log estimate varies by at most 1.7; a warning where it cannot be
+    had.
+    """
     normal = np.random.default_rng(0).normal(0, 1, (256, 4))
     assert _choose([normal], 64) == 2 and _choose([0.1 * normal], 64) == 1
     assert 8 <= _choose([2.0 * normal], 64) <= 64
     with (
-        pytest.warns(UserWarning, match="of 4 particles has a standard deviation of .*: above 1.7 the chain sticks"),
+        pytest.warns(
+            UserWarning,
+            match="of 4 particles has a standard deviation of .*: above 1.7 the chain sticks",
+        ),
         pytest.warns(UserWarning, match="too heavy a tail: k̂ is .* on average over the data"),
     ):
         assert _choose([6.0 * normal], 4) == 4
-    tail = 1.6 * np.random.default_rng(1).exponential(size=(256, 1))  # of a mean that does not exist, and an SD of 1.6
+    # of a mean that does not exist, and an SD of 1.6
+    tail = 1.6 * np.random.default_rng(1).exponential(size=(256, 1))
     for weights in ([tail], [0.1 * normal, tail]):
-        with pytest.warns(UserWarning, match=r"too heavy a tail: k̂ is .* at most 1\.\d.*give `num_particles`"):
+        with pytest.warns(
+            UserWarning, match=r"too heavy a tail: k̂ is .* at most 1\.\d.*give `num_particles`"
+        ):
             assert _choose(weights, 64) <= 2
     kernel = CorrelatedPseudoMarginal(conjugate)
     kernel.init(jr.key(0), 10, None, (DATA,), {})
@@ -280,14 +382,18 @@ def test_number_of_particles():
 
 def shared_noise(data):
     """Two data driven by one noise, which no single decision about one of them can move."""
-    law = nb.DiffusionEndpoint(nb.LinearSDE(-1.0, 0.6), np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4)
+    law = nb.DiffusionEndpoint(
+        nb.LinearSDE(-1.0, 0.6), np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4
+    )
     noise = numpyro.sample("noise", law.noise_prior(), infer={"driving_noise": True})
     numpyro.sample("a", law.given(noise), obs=data[0])
     numpyro.sample("b", law.given(noise), obs=data[1])
 
 
 def used_elsewhere(data):
-    law = nb.DiffusionEndpoint(nb.LinearSDE(-1.0, 0.6), np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4)
+    law = nb.DiffusionEndpoint(
+        nb.LinearSDE(-1.0, 0.6), np.zeros(2), nb.InexactMatch(0.1), t1=1.0, num_steps=4
+    )
     noise = numpyro.sample("noise", law.noise_prior(), infer={"driving_noise": True})
     numpyro.sample("a", law.given(noise), obs=data[0])
     numpyro.factor("more", -jnp.sum(noise**2))
@@ -312,8 +418,12 @@ def test_noise_with_another_use_has_its_posterior():
 
 
 def test_small_turns_are_accepted():
-    """The energy error of `PCNL` is of third order in its angle: a kick whose work is left out would be of first."""
-    state = (kernel := PCNL(NOISE_ONLY, angle=0.1, adapt_angle=False)).init(jr.key(0), 0, None, (DATA,), {})
+    """The energy error of `PCNL` is of third order in its angle: a kick whose work is left out
+    would be of first.
+    """
+    state = (kernel := PCNL(NOISE_ONLY, angle=0.1, adapt_angle=False)).init(
+        jr.key(0), 0, None, (DATA,), {}
+    )
 
     def one(state, _):
         state = kernel.sample(state, (DATA,), {})
@@ -337,7 +447,9 @@ def test_chain_methods_and_pickling():
 
 
 def test_chains_start_near_the_mode():
-    """The Laplace approximation of a normal posterior is that posterior: no transient is left to the warm-up."""
+    """The Laplace approximation of a normal posterior is that posterior: no transient is left to
+    the warm-up.
+    """
     state = FunctionSpaceHMC(conjugate).init(jr.split(jr.key(0), 200), 0, None, (DATA,), {})
     mean, sd = conjugate_posterior()
     start = np.asarray(state.z["mean"])

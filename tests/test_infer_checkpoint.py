@@ -20,13 +20,16 @@ from numpyro_bridges.infer import PCN, FunctionSpaceHMC, _checkpoint, noise_site
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
 DATUM, KEY = np.array([0.4]), jr.key(1)
-WARMUP, SAMPLES, INTERVAL = 20, 30, 8  # one interval crosses the end of the warm-up, and the last is short
+# one interval crosses the end of the warm-up, and the last is short
+WARMUP, SAMPLES, INTERVAL = 20, 30, 8
 
 
 def model(datum=None, spread=2.0):
     mean = numpyro.sample("mean", dist.Normal(0.0, spread))
     numpyro.deterministic("twice", 2 * mean)
-    law = nb.DiffusionEndpoint(nb.LinearSDE(-1.0, 0.6, mean), np.zeros(1), nb.InexactMatch(0.1), t1=1.0, num_steps=1)
+    law = nb.DiffusionEndpoint(
+        nb.LinearSDE(-1.0, 0.6, mean), np.zeros(1), nb.InexactMatch(0.1), t1=1.0, num_steps=1
+    )
     nb.sample("wing", law, obs=datum)
 
 
@@ -48,7 +51,9 @@ def gibbs(model):
 
 def sampler(kernel=hmc, num_chains=1, chain_method="sequential", **settings):
     sizes = {"num_warmup": WARMUP, "num_samples": SAMPLES} | settings
-    return MCMC(kernel(model), num_chains=num_chains, chain_method=chain_method, progress_bar=False, **sizes)
+    return MCMC(
+        kernel(model), num_chains=num_chains, chain_method=chain_method, progress_bar=False, **sizes
+    )
 
 
 def assert_same(mcmc, other):
@@ -88,13 +93,17 @@ RUNS = {
 
 @pytest.mark.parametrize("kernel, num_chains, method, key, cut", RUNS.values(), ids=RUNS.keys())
 def test_cut_off_run_goes_on(kernel, num_chains, method, key, cut, tmp_path, monkeypatch):
-    """From a copy of the directory as a kill during a write leaves it, with half of the file under its other name."""
+    """From a copy of the directory as a kill during a write leaves it, with half of the file under
+    its other name.
+    """
 
     def snapshot(number, file, arrays):
         if number == cut:
             shutil.copytree(tmp_path / "whole", tmp_path / "cut")
             np.savez(half := io.BytesIO(), **arrays)
-            (tmp_path / "cut" / file.with_suffix(".tmp").name).write_bytes(half.getvalue()[: len(half.getvalue()) // 2])
+            (tmp_path / "cut" / file.with_suffix(".tmp").name).write_bytes(
+                half.getvalue()[: len(half.getvalue()) // 2]
+            )
 
     Counted.traces = 0
     with monkeypatch.context() as patch:
@@ -118,16 +127,30 @@ def test_as_after_run(tmp_path, capsys):
     plain = sampler(thinning=3)
     plain.run(KEY, DATUM, extra_fields=("potential_energy",))
     mcmc = sampler(thinning=3)
-    run_checkpointed(mcmc, tmp_path, KEY, DATUM, interval=INTERVAL, keep_noise=2, extra_fields=("potential_energy",))
+    run_checkpointed(
+        mcmc,
+        tmp_path,
+        KEY,
+        DATUM,
+        interval=INTERVAL,
+        keep_noise=2,
+        extra_fields=("potential_energy",),
+    )
     expected, found = plain.get_samples(group_by_chain=True), mcmc.get_samples(group_by_chain=True)
     assert set(found) == {"mean", "twice"} and found["mean"].shape == (1, SAMPLES // 3)
     for name in found:
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-9)
     fields = mcmc.get_extra_fields(group_by_chain=True)
-    np.testing.assert_allclose(fields["noise"]["wing_noise"], expected["wing_noise"][:, 1::2], rtol=1e-9)
-    np.testing.assert_allclose(fields["potential_energy"], plain.get_extra_fields(True)["potential_energy"], rtol=1e-9)
+    np.testing.assert_allclose(
+        fields["noise"]["wing_noise"], expected["wing_noise"][:, 1::2], rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        fields["potential_energy"], plain.get_extra_fields(True)["potential_energy"], rtol=1e-9
+    )
     assert mcmc.get_extra_fields()["noise"]["wing_noise"].shape[0] == SAMPLES // 6
-    np.testing.assert_allclose(mcmc.last_state.z["wing_noise"], plain.last_state.z["wing_noise"], rtol=1e-9)
+    np.testing.assert_allclose(
+        mcmc.last_state.z["wing_noise"], plain.last_state.z["wing_noise"], rtol=1e-9
+    )
     assert mcmc.last_state.rng_key == plain.last_state.rng_key
     mcmc.print_summary()
     assert "mean" in capsys.readouterr().out
@@ -146,7 +169,11 @@ def test_files_are_without_the_noise(whole):
     assert set(mcmc.get_samples()) == {"mean", "twice"}
     assert "wing_noise" in mcmc.last_state.z
     with np.load(folder / "draws_000000016.npz") as draws:
-        assert {k: draws[k].shape for k in draws} == {"z/mean": (1, 4), "z/twice": (1, 4), "diverging": (1, 4)}
+        assert {k: draws[k].shape for k in draws} == {
+            "z/mean": (1, 4),
+            "z/twice": (1, 4),
+            "diverging": (1, 4),
+        }
     starts = [int(file.stem[6:]) for file in sorted(folder.glob("draws*.npz"))]
     assert starts == [16, 24, 32, 40, 48]
 
@@ -159,7 +186,9 @@ def test_longer_chain(whole, tmp_path):
     run_checkpointed(longer, tmp_path / "long", KEY, DATUM, interval=INTERVAL)
     run_checkpointed(fresh, tmp_path / "fresh", KEY, DATUM, interval=INTERVAL)
     assert_same(longer, fresh)
-    np.testing.assert_array_equal(longer.get_samples()["mean"][:SAMPLES], mcmc.get_samples()["mean"])
+    np.testing.assert_array_equal(
+        longer.get_samples()["mean"][:SAMPLES], mcmc.get_samples()["mean"]
+    )
     again = sampler()
     run_checkpointed(again, folder, KEY, DATUM, interval=INTERVAL)
     assert_same(again, mcmc)
@@ -195,8 +224,18 @@ OTHER = {
     "thinning: 1 there, 2 in": lambda: (sampler(thinning=2), KEY, (DATUM,), {}),
     "interval: 8 there, 9 in": lambda: (sampler(), KEY, (DATUM,), {"interval": 9}),
     "keep_noise: None there, 1 in": lambda: (sampler(), KEY, (DATUM,), {"keep_noise": 1}),
-    r"rng_key: key<fry>\[\] \[0, 1\] there, key<fry>\[\] \[0, 2\] in": lambda: (sampler(), jr.key(2), (DATUM,), {}),
-    r"args/0: float64\[1\] \[0.4\] there, float64\[1\] \[0.5\] in": lambda: (sampler(), KEY, (DATUM + 0.1,), {}),
+    r"rng_key: key<fry>\[\] \[0, 1\] there, key<fry>\[\] \[0, 2\] in": lambda: (
+        sampler(),
+        jr.key(2),
+        (DATUM,),
+        {},
+    ),
+    r"args/0: float64\[1\] \[0.4\] there, float64\[1\] \[0.5\] in": lambda: (
+        sampler(),
+        KEY,
+        (DATUM + 0.1,),
+        {},
+    ),
     "args/1: None there, 3.0 in": lambda: (sampler(), KEY, (DATUM, 3.0), {}),
     "kwargs/spread: None there, 3.0 in": lambda: (sampler(), KEY, (DATUM,), {"spread": 3.0}),
     "init_params/mean: None there": lambda: (
@@ -205,7 +244,12 @@ OTHER = {
         (DATUM,),
         {"init_params": {"mean": 0.0, "wing_noise": np.zeros((1, 1, 1))}},
     ),
-    r"extra_fields: \[\] there, \['energy'\] in": lambda: (sampler(), KEY, (DATUM,), {"extra_fields": ("energy",)}),
+    r"extra_fields: \[\] there, \['energy'\] in": lambda: (
+        sampler(),
+        KEY,
+        (DATUM,),
+        {"extra_fields": ("energy",)},
+    ),
     "`extra_fields` must be names of fields, .*; got 'i.x'": lambda: (
         sampler(),
         KEY,
@@ -219,7 +263,12 @@ OTHER = {
         (DATUM,),
         {},
     ),
-    "`num_samples` must be 30 or more, .*; got 29": lambda: (sampler(num_samples=29), KEY, (DATUM,), {}),
+    "`num_samples` must be 30 or more, .*; got 29": lambda: (
+        sampler(num_samples=29),
+        KEY,
+        (DATUM,),
+        {},
+    ),
 }
 
 
@@ -236,13 +285,20 @@ def test_other_shapes_are_refused(whole):
         numpyro.sample("v", dist.Normal(mean, 1.0), obs=datum)
 
     mcmc = MCMC(hmc(another), num_warmup=WARMUP, num_samples=SAMPLES, progress_bar=False)
-    with pytest.raises(ValueError, match=r"the shape of draw/z/mean: float64\[\] there, float64\[2\] in this call"):
+    with pytest.raises(
+        ValueError, match=r"the shape of draw/z/mean: float64\[\] there, float64\[2\] in this call"
+    ):
         run_checkpointed(mcmc, whole[1], KEY, DATUM, interval=INTERVAL)
 
 
 def test_another_model_is_noticed(whole):
     """One with the same sites and arguments: by where its chains start."""
-    mcmc = MCMC(hmc(lambda datum: model(datum, spread=2.1)), num_warmup=WARMUP, num_samples=SAMPLES, progress_bar=False)
+    mcmc = MCMC(
+        hmc(lambda datum: model(datum, spread=2.1)),
+        num_warmup=WARMUP,
+        num_samples=SAMPLES,
+        progress_bar=False,
+    )
     with pytest.warns(UserWarning, match="started elsewhere"):
         run_checkpointed(mcmc, whole[1], KEY, DATUM, interval=INTERVAL)
 
@@ -257,7 +313,9 @@ def test_other_files_are_refused(whole, tmp_path):
     state = tmp_path / "state.npz"
     for content in (b"", b"no archive", (whole[1] / "state.npz").read_bytes()[:-100]):
         state.write_bytes(content)
-        with pytest.raises(ValueError, match=r"state.npz that cannot be read, .* Choose another path"):
+        with pytest.raises(
+            ValueError, match=r"state.npz that cannot be read, .* Choose another path"
+        ):
             run(tmp_path)
     np.savez(state, x=np.zeros(2))
     with pytest.raises(ValueError, match="of another program. Choose another `path`"):

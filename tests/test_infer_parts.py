@@ -56,7 +56,11 @@ def test_reference():
 
 
 def badly_scaled(x):
-    return 0.5 * x @ jnp.array([[400.0, 6.0, 0.0], [6.0, 0.5, 0.05], [0.0, 0.05, 0.02]]) @ x - x[0] + x[2]
+    return (
+        0.5 * x @ jnp.array([[400.0, 6.0, 0.0], [6.0, 0.5, 0.05], [0.0, 0.05, 0.02]]) @ x
+        - x[0]
+        + x[2]
+    )
 
 
 def bent(x):
@@ -72,7 +76,9 @@ POTENTIALS = [(badly_scaled, [3.0, -1.0, 2.0]), (bent, [-1.2, 1.0, 0.3]), (bent,
 def test_laplace(potential, start):
     """The mode as SciPy finds it, and the inverse Hessian there, to a factor: a first mass matrix."""
     found = jax.jit(lambda x: laplace(potential, x))(jnp.asarray(start))
-    mode = scipy.optimize.minimize(potential, np.ones(3), jac=jax.grad(potential), method="BFGS", tol=1e-9).x
+    mode = scipy.optimize.minimize(
+        potential, np.ones(3), jac=jax.grad(potential), method="BFGS", tol=1e-9
+    ).x
     covariance = found.scale @ found.scale.T
     np.testing.assert_allclose(found.mean, mode, atol=1e-3 * np.sqrt(np.diag(covariance)).max())
     ratios = scipy.linalg.eigvalsh(covariance, np.linalg.inv(jax.hessian(potential)(mode)))
@@ -80,7 +86,9 @@ def test_laplace(potential, start):
 
 
 def test_laplace_in_single_precision():
-    """Rounding near the mode does not get into the inverse Hessian, from any start: SDs to a factor of 2."""
+    """Rounding near the mode does not get into the inverse Hessian, from any start: SDs to a factor
+    of 2.
+    """
     data = (2000 + np.random.default_rng(1).normal(size=(200, 20))).astype(np.float32)
 
     def potential(x):
@@ -90,9 +98,13 @@ def test_laplace_in_single_precision():
     with jax.enable_x64(False):
         starts = np.random.default_rng(0).normal([2000.0, 0.5], 0.3, (20, 2)).astype(np.float32)
         found = jax.jit(jax.vmap(lambda x: laplace(potential, x)))(starts)
-    mode = scipy.optimize.minimize(potential, np.array([2000.0, 0.0]), jac=jax.grad(potential), method="BFGS").x
+    mode = scipy.optimize.minimize(
+        potential, np.array([2000.0, 0.0]), jac=jax.grad(potential), method="BFGS"
+    ).x
     covariance = np.linalg.inv(jax.hessian(potential)(mode))
-    for mean, scale in zip(np.asarray(found.mean, float), np.asarray(found.scale, float), strict=True):
+    for mean, scale in zip(
+        np.asarray(found.mean, float), np.asarray(found.scale, float), strict=True
+    ):
         assert np.all(np.abs(mean - mode) < 0.5 * np.sqrt(np.diag(covariance)))
         ratios = scipy.linalg.eigvalsh(scale @ scale.T, covariance)
         assert np.all((ratios > 1 / 4) & (ratios < 4)), ratios
@@ -114,13 +126,17 @@ def test_windows():
     covariance = np.cov(draws[12:36].T)
     covariance[0, 1] = covariance[1, 0] = covariance[0, 1] * 24 / 29
     np.testing.assert_allclose(windows.reference.mean, draws[12:36].mean(0), rtol=1e-12)
-    np.testing.assert_allclose(windows.reference.scale @ windows.reference.scale.T, covariance, rtol=1e-12)
+    np.testing.assert_allclose(
+        windows.reference.scale @ windows.reference.scale.T, covariance, rtol=1e-12
+    )
 
 
 def several(data):
     """Two kinds of data with noise of their own, a datum without, and a factor."""
     mean = numpyro.sample("mean", dist.LogNormal(0.0, 1.0))
-    law = nb.DiffusionEndpoint(nb.LinearSDE(-1.0, 0.6, mean), np.zeros(1), nb.InexactMatch(0.1), t1=1.0, num_steps=2)
+    law = nb.DiffusionEndpoint(
+        nb.LinearSDE(-1.0, 0.6, mean), np.zeros(1), nb.InexactMatch(0.1), t1=1.0, num_steps=2
+    )
     with numpyro.plate("specimen", 2):
         nb.sample("wing", law, obs=data)
     nb.sample("leg", law, obs=data[0])
@@ -131,7 +147,11 @@ def several(data):
 def test_energies_add_up():
     """With the prior of the noise, to NumPyro's potential energy, however they are grouped."""
     data = RNG.normal(size=(2, 1))
-    z = {"mean": jnp.array(0.4), "wing_noise": RNG.normal(size=(2, 2, 1, 1)), "leg_noise": RNG.normal(size=(2, 1, 1))}
+    z = {
+        "mean": jnp.array(0.4),
+        "wing_noise": RNG.normal(size=(2, 2, 1, 1)),
+        "leg_noise": RNG.normal(size=(2, 1, 1)),
+    }
     noise = [z["wing_noise"], z["leg_noise"]]
     prior = sum(np.sum(u**2 + np.log(2 * np.pi)) / 2 for u in noise)
     expected = potential_energy(numpyro.handlers.seed(several, 0), (data,), {}, z) - prior
@@ -145,10 +165,16 @@ def test_energies_add_up():
 
 
 def test_energies_under_scale():
-    """`handlers.scale` multiplies the noise's prior too: what it adds is part of the misfit, and no datum's own."""
+    """`handlers.scale` multiplies the noise's prior too: what it adds is part of the misfit, and no
+    datum's own.
+    """
     data, scale = RNG.normal(size=(2, 1)), 2.5
     scaled = numpyro.handlers.scale(several, scale=scale)
-    z = {"mean": jnp.array(0.4), "wing_noise": RNG.normal(size=(2, 2, 1, 1)), "leg_noise": RNG.normal(size=(2, 1, 1))}
+    z = {
+        "mean": jnp.array(0.4),
+        "wing_noise": RNG.normal(size=(2, 2, 1, 1)),
+        "leg_noise": RNG.normal(size=(2, 1, 1)),
+    }
     prior = sum(np.sum(z[k] ** 2 + np.log(2 * np.pi)) / 2 for k in ("wing_noise", "leg_noise"))
     whole = potential_energy(numpyro.handlers.seed(several, 0), (data,), {}, z)
     np.testing.assert_allclose(misfit(scaled, (data,), {}, z), scale * whole - prior, rtol=1e-12)

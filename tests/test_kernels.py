@@ -1,4 +1,6 @@
-"""Kernels: docstring formulas retyped in NumPy, closed forms against SciPy quadrature, what is refused."""
+"""Kernels: docstring formulas retyped in NumPy, closed forms against SciPy quadrature, what is
+refused.
+"""
 
 from functools import partial
 
@@ -67,7 +69,9 @@ def test_positive_definite(kernel, formula):
 def test_matern_orders(order):
     s = np.array([0.0, 0.01, 1.0, 30.0])
     r = np.sqrt(s)
-    np.testing.assert_allclose(MaternKernel(A, L, order).profile(s), MATERN[order](r) * np.exp(-r), rtol=1e-14)
+    np.testing.assert_allclose(
+        MaternKernel(A, L, order).profile(s), MATERN[order](r) * np.exp(-r), rtol=1e-14
+    )
     assert MaternKernel(A, L).order == 4
 
 
@@ -75,7 +79,9 @@ def test_a_regularised_root_makes_no_difference():
     # r = √(ρ² + 1e-8), as other implementations write it.
     x = np.concatenate([points(8, 2), points(1, 2)])
     r = np.sqrt(distances(x, x) ** 2 / 0.25**2 + 1e-8)
-    np.testing.assert_allclose(matrix(MaternKernel(0.1, 0.25), x, x), 0.1 * MATERN[4](r) * np.exp(-r), rtol=2e-8)
+    np.testing.assert_allclose(
+        matrix(MaternKernel(0.1, 0.25), x, x), 0.1 * MATERN[4](r) * np.exp(-r), rtol=2e-8
+    )
 
 
 @CASES
@@ -137,7 +143,10 @@ def test_convolution_on_the_line(kernel, formula, request):
     u = 0.35
     if "combination" in request.node.callspec.id:
         kernel = 2.0 * GaussianKernel(A, L) + GaussianKernel(0.3, 1.1)
-        formula = lambda r: 2 * A * np.exp(-(r**2) / (2 * L**2)) + 0.3 * np.exp(-(r**2) / (2 * 1.1**2))  # noqa: E731
+
+        def formula(r):
+            return 2 * A * np.exp(-(r**2) / (2 * L**2)) + 0.3 * np.exp(-(r**2) / (2 * 1.1**2))
+
     value = kernel.convolved(1)(jnp.array([0.1]), jnp.array([0.1 + u]))
     np.testing.assert_allclose(value, quadrature_1d(formula, formula, u), rtol=1e-9)
 
@@ -171,20 +180,29 @@ def test_matern_convolution_in_space(order):
     expected = np.sum(wz[:, None] * w * 2 * np.pi * rho * profile(near) * profile(far))
     covariance = MaternKernel(A, L, order).convolved(3)
     assert covariance.order == 2 * order + 2
-    np.testing.assert_allclose(covariance(jnp.zeros(3), jnp.array([0.0, 0.0, u])), expected, rtol=1e-6)
+    np.testing.assert_allclose(
+        covariance(jnp.zeros(3), jnp.array([0.0, 0.0, u])), expected, rtol=1e-6
+    )
 
 
 @CASES
 def test_spectral_density_on_the_line(kernel, formula):
     for omega in (0.0, 0.9, 4.0):
-        transform = 2 * quad(formula, 0, np.inf, weight="cos", wvar=omega)[0] if omega else 2 * quad(formula, 0, 40)[0]
-        np.testing.assert_allclose(kernel.spectral_density(jnp.array([omega]), 1), transform, rtol=1e-6)
+        transform = (
+            2 * quad(formula, 0, np.inf, weight="cos", wvar=omega)[0]
+            if omega
+            else 2 * quad(formula, 0, 40)[0]
+        )
+        np.testing.assert_allclose(
+            kernel.spectral_density(jnp.array([omega]), 1), transform, rtol=1e-6
+        )
 
 
 @CASES
 @pytest.mark.parametrize("dim", [2, 3])
 def test_spectral_density_gives_the_kernel_back(kernel, formula, dim):
-    # k(u) = (2π)^-dim ∫ q̂ cos(ω·u) dω at u = 0, in polar coordinates; heavy tails need a substitution.
+    # k(u) = (2π)^-dim ∫ q̂ cos(ω·u) dω at u = 0, in polar coordinates; heavy tails need a
+    # substitution.
     area = {2: 2 * np.pi, 3: 4 * np.pi}[dim]
     t, w = np.polynomial.legendre.leggauss(200)
     t, w = np.pi / 4 * (t + 1), np.pi / 4 * w
@@ -211,14 +229,18 @@ def test_quadrature_covariance():
     np.testing.assert_allclose(K := matrix(box, x, x), matrix(exact, x, x), rtol=1e-9)
     np.testing.assert_allclose(box.variance, exact.variance, rtol=1e-9)
     np.testing.assert_allclose(K, K.T, rtol=1e-14)
-    uneven = QuadratureCovariance(MaternKernel(A, L), np.array([-5.0, -4]), np.array([5.0, 4]), (50, 40))
+    uneven = QuadratureCovariance(
+        MaternKernel(A, L), np.array([-5.0, -4]), np.array([5.0, 4]), (50, 40)
+    )
     assert uneven.centres.shape == (2000, 2)
     np.testing.assert_allclose(uneven.centres[0], [-4.9, -3.9])
     np.testing.assert_allclose(uneven.cell_volume, 0.04)
     # On the line the Matérn convolution is closed.
     line = QuadratureCovariance(MaternKernel(A, L), [-12.0], [12.0], 400)
     u = np.array([[0.0], [0.7]])
-    np.testing.assert_allclose(matrix(line, u, u), matrix(MaternKernel(A, L).convolved(1), u, u), rtol=1e-8)
+    np.testing.assert_allclose(
+        matrix(line, u, u), matrix(MaternKernel(A, L).convolved(1), u, u), rtol=1e-8
+    )
 
 
 # Parameters, precision, transformations.
@@ -237,7 +259,9 @@ def test_integers_are_numbers():
     kernel = GaussianKernel(1, np.int64(2))
     assert {kernel.amplitude.dtype, kernel.length_scale.dtype} == {jnp.dtype("float64")}
     assert not kernel.amplitude.weak_type
-    np.testing.assert_allclose(kernel.matrix(np.array([[0]]), np.array([[2]])), np.exp(-0.5), rtol=1e-14)
+    np.testing.assert_allclose(
+        kernel.matrix(np.array([[0]]), np.array([[2]])), np.exp(-0.5), rtol=1e-14
+    )
     mixed = GaussianKernel(jnp.float32(0.5), 2.0)
     assert mixed.convolved(2).variance.dtype == jnp.float64
 
@@ -245,7 +269,9 @@ def test_integers_are_numbers():
 def test_numpy_factors():
     x = points(3, 2)
     for kernel in (np.float64(2.0) * GaussianKernel(A, L), jnp.asarray(2.0) * GaussianKernel(A, L)):
-        np.testing.assert_allclose(kernel.matrix(x, x), 2 * GaussianKernel(A, L).matrix(x, x), rtol=1e-15)
+        np.testing.assert_allclose(
+            kernel.matrix(x, x), 2 * GaussianKernel(A, L).matrix(x, x), rtol=1e-15
+        )
     with pytest.raises(TypeError, match="unsupported operand"):
         GaussianKernel(A, L) + 1.0
 
@@ -255,7 +281,11 @@ def test_traced_parameters():
 
     @jax.jit
     def total(amplitude):
-        return jnp.sum((2.0 * GaussianKernel(amplitude, L) + GaussianKernel(1.0, 0.9)).convolved(2).matrix(x, x))
+        return jnp.sum(
+            (2.0 * GaussianKernel(amplitude, L) + GaussianKernel(1.0, 0.9))
+            .convolved(2)
+            .matrix(x, x)
+        )
 
     values = jax.vmap(total)(jnp.array([0.5, -1.0]))  # a traced value cannot be checked
     np.testing.assert_allclose(values[0], total(0.5), rtol=1e-14)
@@ -286,9 +316,13 @@ def test_a_batch_of_kernels():
 @pytest.mark.parametrize("kernel_class", [GaussianKernel, MaternKernel])
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
 def test_parameters_are_positive(kernel_class, bad):
-    with pytest.raises(ValueError, match=f"`amplitude` must be positive and finite; got {bad:g}.*LogNormal"):
+    with pytest.raises(
+        ValueError, match=f"`amplitude` must be positive and finite; got {bad:g}.*LogNormal"
+    ):
         kernel_class(bad, 1.0)
-    with pytest.raises(ValueError, match=f"`length_scale` must be positive and finite; got {bad:g}.*LogNormal"):
+    with pytest.raises(
+        ValueError, match=f"`length_scale` must be positive and finite; got {bad:g}.*LogNormal"
+    ):
         kernel_class(1.0, bad)
     with pytest.raises(ValueError, match="`factor` must be positive and finite"):
         bad * kernel_class(1.0, 1.0)
@@ -305,10 +339,19 @@ def test_parameters_are_positive(kernel_class, bad):
             lambda: MaternKernel(1.0, [0.1]),
             r"`length_scale` must be a scalar; got .*shape \(1,\).*`jax.vmap`",
         ),
-        (lambda: np.ones(2) * GaussianKernel(1.0, 1.0), r"`factor` must be a scalar; got .*shape \(2,\)"),
+        (
+            lambda: np.ones(2) * GaussianKernel(1.0, 1.0),
+            r"`factor` must be a scalar; got .*shape \(2,\)",
+        ),
         (lambda: GaussianKernel("a", 1.0), "`amplitude` must be a number.*got 'a'"),
-        (lambda: MaternKernel(1.0, 1.0, order=-1), "`order` must be an integer, at least 0; got -1"),
-        (lambda: MaternKernel(1.0, 1.0, order=1.5), "`order` must be an integer, at least 0; got 1.5"),
+        (
+            lambda: MaternKernel(1.0, 1.0, order=-1),
+            "`order` must be an integer, at least 0; got -1",
+        ),
+        (
+            lambda: MaternKernel(1.0, 1.0, order=1.5),
+            "`order` must be an integer, at least 0; got 1.5",
+        ),
         (
             lambda: MaternKernel(1.0, 1.0).convolved(2),
             "odd dimensions only; got one in dimension 2.*`covariance=`",
@@ -333,7 +376,10 @@ def test_parameters_are_positive(kernel_class, bad):
         ),
         (lambda: BOX(num_cells=[4]), r"`num_cells` must be a positive integer.*got \[4\]"),
         (lambda: BOX().convolved(2), "is a covariance: it is passed as `covariance=`"),
-        (lambda: BOX().spectral_density(np.ones((1, 2)), 2), "not stationary.*`kernel.spectral_density"),
+        (
+            lambda: BOX().spectral_density(np.ones((1, 2)), 2),
+            "not stationary.*`kernel.spectral_density",
+        ),
         (
             lambda: GaussianKernel(1.0, 1.0).spectral_density(np.ones((4, 2)), 3),
             r"`omega`.*R\^3.*shape \(4, 2\)",
@@ -346,7 +392,10 @@ def test_parameters_are_positive(kernel_class, bad):
             lambda: GaussianKernel(1.0, 1.0).matrix(np.ones(4), np.ones(4)),
             r"`x`.*\(n, dim\); got shape \(4,\)",
         ),
-        (lambda: GaussianKernel(1.0, 1.0).matrix(np.ones((5, 4, 2)), np.ones((4, 2))), "`x`.*`jax.vmap`"),
+        (
+            lambda: GaussianKernel(1.0, 1.0).matrix(np.ones((5, 4, 2)), np.ones((4, 2))),
+            "`x`.*`jax.vmap`",
+        ),
     ],
 )
 def test_refuses(make, message):
@@ -355,4 +404,6 @@ def test_refuses(make, message):
 
 
 def BOX(lower=(0.0, 0.0), upper=(1.0, 1.0), num_cells=4):
-    return QuadratureCovariance(GaussianKernel(1.0, 1.0), np.asarray(lower), np.asarray(upper), num_cells)
+    return QuadratureCovariance(
+        GaussianKernel(1.0, 1.0), np.asarray(lower), np.asarray(upper), num_cells
+    )

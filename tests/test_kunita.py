@@ -1,6 +1,8 @@
-"""The Kunita flow: its covariance, three representations of its noise, and guides on simulated and on real shapes.
+"""The Kunita flow: its covariance, three representations of its noise, and guides on simulated and
+on real shapes.
 
-Referees: quadrature in the plane, formulas retyped in NumPy, ends simulated in NumPy, and long runs of other code.
+Referees: quadrature in the plane, formulas retyped in NumPy, ends simulated in NumPy, and long runs
+of other code.
 """
 
 import jax
@@ -21,7 +23,9 @@ def covariance(x, alpha=ALPHA, length=LENGTH):
 
 
 def flow_covariance(noise):
-    flow = nb.KunitaFlow(nb.Landmarks(len(POINTS), 2), nb.GaussianKernel(ALPHA, LENGTH), noise=noise)
+    flow = nb.KunitaFlow(
+        nb.Landmarks(len(POINTS), 2), nb.GaussianKernel(ALPHA, LENGTH), noise=noise
+    )
     sigma, a = jax.jit(lambda x: flow.noise(0.0, x))(POINTS)
     np.testing.assert_allclose(sigma @ sigma.T, a, atol=1e-9 * a[0, 0])
     return flow, np.asarray(a)
@@ -69,7 +73,9 @@ def test_point_sd():
 @pytest.mark.filterwarnings("ignore:the noise is wrong by more than 1 %")
 @pytest.mark.parametrize("modes, period", [(2, None), (4, None), (7, None), (12, None), (12, 4.5)])
 def test_spectral_covariance(modes, period):
-    """Within what the representation says that it leaves out; 1e-8 with the default period and 12 modes."""
+    """Within what the representation says that it leaves out; 1e-8 with the default period and 12
+    modes.
+    """
     diameter = 2.1  # of the points
     assert np.max(np.linalg.norm(POINTS[:, None] - POINTS[None], axis=-1)) < diameter
     flow, found = flow_covariance(nb.SpectralNoise(modes, period, diameter))
@@ -77,7 +83,9 @@ def test_spectral_covariance(modes, period):
     error = np.abs(found - truth) / truth[0, 0]
     tail, wrap_around = (float(flow.noise_error()[name]) for name in ("tail", "wrap_around"))
     P = diameter + 8.6 * LENGTH if period is None else period
-    np.testing.assert_allclose(wrap_around, np.exp(-((P - diameter) ** 2) / (4 * LENGTH**2)), rtol=1e-9)
+    np.testing.assert_allclose(
+        wrap_around, np.exp(-((P - diameter) ** 2) / (4 * LENGTH**2)), rtol=1e-9
+    )
     # images at the four sides of the box; the tail is the largest error, that on the diagonal
     assert np.max(error) < 1.01 * tail + 4 * wrap_around + 1e-14
     if wrap_around < 1e-3 * tail:
@@ -87,7 +95,9 @@ def test_spectral_covariance(modes, period):
 
 
 def test_grid_covariance():
-    """The error of Σ_y k k Δy falls faster than any power of the cells' width, down to what the border cuts off."""
+    """The error of Σ_y k k Δy falls faster than any power of the cells' width, down to what the
+    border cuts off.
+    """
     errors = []
     for cells in (4, 8, 12, 16, 24):
         _, found = flow_covariance(nb.GridNoise(-5.0, 5.0, cells))
@@ -106,14 +116,18 @@ SEEN = nb.InexactMatch(VARIANCE)
 
 
 def simulated_log_evidence(count):
-    """The mean density of the datum over ends that are simulated from Cholesky factors, and its standard error."""
+    """The mean density of the datum over ends that are simulated from Cholesky factors, and its
+    standard error.
+    """
     rng, n = np.random.default_rng(5), len(X0)
     x = np.broadcast_to(X0, (count, n, 2))
     for _ in range(STEPS):
         K = (covariance(x) + 1e-10 * np.eye(n)) / STEPS
         x = x + np.linalg.cholesky(K) @ rng.normal(size=(count, n, 2))
     variance = VARIANCE * n
-    log_density = -0.5 * np.sum((DATUM - x) ** 2, axis=(1, 2)) / variance - n * np.log(2 * np.pi * variance)
+    log_density = -0.5 * np.sum((DATUM - x) ** 2, axis=(1, 2)) / variance - n * np.log(
+        2 * np.pi * variance
+    )
     top = log_density.max()
     w = np.exp(log_density - top)
     return np.log(w.mean()) + top, w.std() / w.mean() / np.sqrt(count)
@@ -128,7 +142,9 @@ def test_evidence_of_the_same_flow_in_three_representations():
     }
     found = {"simulated": simulated_log_evidence(60_000)}
     for i, (name, noise) in enumerate(noises.items()):
-        flow = nb.KunitaFlow(nb.Landmarks(len(X0), 2), nb.GaussianKernel(ALPHA, LENGTH), noise=noise)
+        flow = nb.KunitaFlow(
+            nb.Landmarks(len(X0), 2), nb.GaussianKernel(ALPHA, LENGTH), noise=noise
+        )
         bridge = nb.GuidedBridge(flow, SEEN.at(DATUM), x0=X0, ts=np.linspace(0, 1, STEPS + 1))
         result = nb.estimate_evidence(bridge, jr.key(i), 1500, batch_size=1500)
         assert result.pareto_k < 0.7
@@ -149,12 +165,16 @@ def log_weights(flow, match, x0, data, num_steps, guide, count):
     @jax.jit
     def run(data, z):
         def one(v):
-            bridge = nb.GuidedBridge(flow, match.at(v), x0=x0, ts=np.linspace(0, 1, num_steps + 1), guide=guide)
+            bridge = nb.GuidedBridge(
+                flow, match.at(v), x0=x0, ts=np.linspace(0, 1, num_steps + 1), guide=guide
+            )
             return jax.lax.map(bridge.log_weight, z, batch_size=100)
 
         return jax.lax.map(one, data)
 
-    return np.asarray(run(jnp.asarray(data), jr.normal(jr.key(0), (count, num_steps, *np.shape(x0)))))
+    return np.asarray(
+        run(jnp.asarray(data), jr.normal(jr.key(0), (count, num_steps, *np.shape(x0))))
+    )
 
 
 REFERENCE = {0: (24.75, 0.08), 1: (16.40, 0.09), 2: (9.65, 0.11)}
@@ -164,7 +184,9 @@ REFERENCE = {0: (24.75, 0.08), 1: (16.40, 0.09), 2: (9.65, 0.11)}
 def simulated_targets(shared_data):
     data = np.load(shared_data / "kunita_cases" / "kunita_cases.npz")
     space = nb.Landmarks(16, 2, weights=1.0)
-    flow = nb.KunitaFlow(space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5))
+    flow = nb.KunitaFlow(
+        space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5)
+    )
     setting = flow, nb.InexactMatch(1e-3), data["root"], data["edge_targets"], 100
     counts = (nb.RecedingGuide(), 2500), (nb.FrozenGuide(), 300), (nb.GeodesicGuide(), 1000)
     return [log_weights(*setting, guide, count) for guide, count in counts]
@@ -172,14 +194,20 @@ def simulated_targets(shared_data):
 
 @pytest.mark.parametrize("target", REFERENCE)
 def test_simulated_targets(simulated_targets, target):
-    """Evidence as in the table, whose runs have an effective size of 80 to 160, as these; spread of the guides."""
+    """Evidence as in the table, whose runs have an effective size of 80 to 160, as these; spread of
+    the guides.
+    """
     receding, frozen, geodesic = (x[target] for x in simulated_targets)
     value, own = REFERENCE[target]
     found = float(nb.weights.log_mean_exp(receding))
     weight = np.exp(receding - found)
-    error = weight.std(ddof=1) / np.sqrt(weight.size)  # of the weights drawn: the tails of some are not to be trusted
+    # of the weights drawn: the tails of some are not to be trusted
+    error = weight.std(ddof=1) / np.sqrt(weight.size)
     k = float(nb.weights.pareto_k(receding))
-    print(f"log evidence {found:.2f} ± {error:.2f}, k {k:.2f}, SD {receding.std():.2f} and {frozen.std():.2f}")
+    print(
+        f"log evidence {found:.2f} ± {error:.2f}, k {k:.2f}, SD {receding.std():.2f} and "
+        f"{frozen.std():.2f}"
+    )
     assert error < 0.2
     assert abs(found - value) < 3 * np.hypot(error, own)
     assert receding.std() < 3
@@ -189,10 +217,14 @@ def test_simulated_targets(simulated_targets, target):
 
 
 def test_a_simulated_tree(shared_data):
-    """Nine tips, 12 branches of 100 steps. Decided before the run: Ψ of mean at least 72 and of SD at most 8."""
+    """Nine tips, 12 branches of 100 steps. Decided before the run: Ψ of mean at least 72 and of SD
+    at most 8.
+    """
     data = np.load(shared_data / "kunita_cases" / "kunita_cases.npz")
     space, steps = nb.Landmarks(16, 2, weights=1.0), 100
-    flow = nb.KunitaFlow(space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5))
+    flow = nb.KunitaFlow(
+        space, covariance=nb.MaternKernel(0.1, 0.25, order=4), noise=nb.LandmarkNoise(jitter=1e-5)
+    )
     tree = nb.Tree.from_newick("((a:1,b:1,c:1):1,(d:1,e:1,f:1):1,(g:1,h:1,i:1):1);")
     law = nb.DiffusionTree(flow, data["root"], nb.InexactMatch(1e-3), tree=tree, num_steps=steps)
 
@@ -204,15 +236,20 @@ def test_a_simulated_tree(shared_data):
     found, nodes = jax.jit(lambda z: jax.lax.map(weighed, z, batch_size=20))(z)
     tips = [node - 1 for node in tree.tips]  # branch i leads to node i + 1
     off = float(np.sqrt(np.mean((nodes[:, np.array(tips)] - data["tree_leaves"][None]) ** 2)))
-    print(f"mean {found.mean():.1f}, SD {found.std():.2f}, tips {off:.4f} from what is seen, whose SD is 0.0316")
+    print(
+        f"mean {found.mean():.1f}, SD {found.std():.2f}, tips {off:.4f} from what is seen, whose "
+        "SD is 0.0316"
+    )
     assert found.mean() > 72 and found.std() < 8
     assert off < 1.2 * np.sqrt(1e-3)
 
 
 def test_real_wings():
-    """Within a genus, from the mean, at a point SD of 0.005 and a field whose SD, 0.035, is that of the wings.
+    """Within a genus, from the mean, at a point SD of 0.005 and a field whose SD, 0.035, is that of
+    the wings.
 
-    Decided before the run: median SD of the log weight 0.6 to 1.3 end-frozen and 0.2 to 0.5 receding.
+    Decided before the run: median SD of the log weight 0.6 to 1.3 end-frozen and 0.2 to 0.5
+    receding.
     """
     pytest.importorskip("ktch", reason="the wings are in the package ktch")
     wings, space = nb.datasets.mosquito_wings(32, "CX"), nb.Landmarks(32, 2)

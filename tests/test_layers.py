@@ -1,4 +1,6 @@
-"""Rules over the whole package: imports go downwards, classes are abstract or final, names are documented."""
+"""Rules over the whole package: imports go downwards, classes are abstract or final, names are
+documented.
+"""
 
 import ast
 import graphlib
@@ -15,7 +17,8 @@ import pytest
 PACKAGE = "numpyro_bridges"
 ROOT = Path(__file__).parents[1] / PACKAGE
 
-# A module imports from the rows above its own, never from its neighbours. Nobody imports the last row.
+# A module imports from the rows above its own, never from its neighbours. Nobody imports the last
+# row.
 LAYERS = [
     {"_types", "_checks", "_files"},
     {"_devices", "_linalg", "weights", "io"},
@@ -34,13 +37,17 @@ LAYERS = [
 LEVEL = {unit: level for level, units in enumerate(LAYERS) for unit in units}
 
 MODULES = {
-    ".".join([PACKAGE, *path.relative_to(ROOT).with_suffix("").parts]).removesuffix(".__init__"): path
+    ".".join([PACKAGE, *path.relative_to(ROOT).with_suffix("").parts]).removesuffix(
+        ".__init__"
+    ): path
     for path in sorted(ROOT.rglob("*.py"))
 }
 
 
 def unit_of(module):
-    """The file or folder of the package that a module is in; empty for the package's own `__init__`."""
+    """The file or folder of the package that a module is in; empty for the package's own
+    `__init__`.
+    """
     return (module.split(".") + [""])[1]
 
 
@@ -72,7 +79,9 @@ def test_imports_go_downwards(module):
     for imported in imports_of(module):
         other = unit_of(imported)
         assert other, f"{module} imports the whole package"
-        assert other == unit or LEVEL[other] < LEVEL[unit], f"{module} imports {imported}, not below it"
+        assert other == unit or LEVEL[other] < LEVEL[unit], (
+            f"{module} imports {imported}, not below it"
+        )
 
 
 def test_no_import_cycles():
@@ -110,16 +119,22 @@ def named_abstract(cls):
 def follows_numpyro(cls):
     """Subclasses of NumPyro's classes follow NumPyro's habits."""
     in_numpyro_layers = unit_of(cls.__module__) in ("distributions", "infer")
-    return in_numpyro_layers and any(base.__module__.split(".")[0] == "numpyro" for base in cls.__mro__)
+    return in_numpyro_layers and any(
+        base.__module__.split(".")[0] == "numpyro" for base in cls.__mro__
+    )
 
 
 def test_classes_are_abstract_or_final():
     for cls in filter(lambda cls: not follows_numpyro(cls), classes()):
-        assert named_abstract(cls) or not is_abstract(cls), f"{cls} is abstract, its name does not say so"
+        assert named_abstract(cls) or not is_abstract(cls), (
+            f"{cls} is abstract, its name does not say so"
+        )
         for base in cls.__mro__[1:]:
             ours = base.__module__.split(".")[0] == PACKAGE
             module = issubclass(base, eqx.Module) and base is not eqx.Module
-            assert named_abstract(base) or not (ours or module), f"{cls} subclasses {base}, which is concrete"
+            assert named_abstract(base) or not (ours or module), (
+                f"{cls} subclasses {base}, which is concrete"
+            )
 
 
 def test_public_names_are_documented():
@@ -130,14 +145,31 @@ def test_public_names_are_documented():
             if ours and callable(value) and not name.startswith("_"):
                 text = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
                 generated = f"{name}("  # by dataclasses, from the fields
-                assert text and not text.startswith(generated), f"{module.__name__}.{name} has no docstring"
+                assert text and not text.startswith(generated), (
+                    f"{module.__name__}.{name} has no docstring"
+                )
 
 
 def test_import_is_light():
     """Plots, data sets and diagnostics are loaded by those who use them."""
-    program = f"import sys, {PACKAGE}; print([name for name in sys.argv[1:] if name in sys.modules])"
-    heavy = ["arviz", "arviz_stats", "xarray", "matplotlib", "ktch", "sklearn", "pandas", "h5netcdf"]
+    program = (
+        f"import sys, {PACKAGE}; print([name for name in sys.argv[1:] if name in sys.modules])"
+    )
+    heavy = [
+        "arviz",
+        "arviz_stats",
+        "xarray",
+        "matplotlib",
+        "ktch",
+        "sklearn",
+        "pandas",
+        "h5netcdf",
+    ]
     loaded = subprocess.run(
-        [sys.executable, "-c", program, *heavy], cwd=ROOT.parent, capture_output=True, text=True, check=True
+        [sys.executable, "-c", program, *heavy],
+        cwd=ROOT.parent,
+        capture_output=True,
+        text=True,
+        check=True,
     ).stdout
     assert loaded.strip() == "[]"

@@ -1,6 +1,8 @@
-"""The likelihood does not depend on the mesh: evidences and posteriors of one curve, coarse and fine.
+"""The likelihood does not depend on the mesh: evidences and posteriors of one curve, coarse and
+fine.
 
-`normalised=False`: the expectation of exp(−‖X_T − v‖²/2σ) has a limit, the Lebesgue density has none.
+`normalised=False`: the expectation of exp(−‖X_T − v‖²/2σ) has a limit, the Lebesgue density has
+none.
 """
 
 import functools
@@ -59,7 +61,11 @@ def frozen(make, n):
     """The log evidence at α = 0.2, and the posterior SD of α under a LogNormal(0, 1) prior."""
     space, project, s = make(n)
     x = start(s)
-    C = project @ (np.pi * LENGTH**2 * np.exp(-np.sum((x[:, None] - x[None]) ** 2, -1) / (4 * LENGTH**2))) @ project.T
+    C = (
+        project
+        @ (np.pi * LENGTH**2 * np.exp(-np.sum((x[:, None] - x[None]) ** 2, -1) / (4 * LENGTH**2)))
+        @ project.T
+    )
     C, x0, v = C + 1e-13 * np.eye(len(C)), project @ x, project @ datum(s)
 
     @jax.jit
@@ -67,12 +73,19 @@ def frozen(make, n):
         def one(alpha):
             sde = nb.BrownianMotion(alpha**2 * C, space=space)
             seen = nb.InexactMatch(VARIANCE, normalised=False).at(v)
-            return nb.GuidedBridge(sde, seen, x0=x0, ts=np.linspace(0, 1, 2)).log_weight(jnp.ones((1, len(C), 2)))
+            return nb.GuidedBridge(sde, seen, x0=x0, ts=np.linspace(0, 1, 2)).log_weight(
+                jnp.ones((1, len(C), 2))
+            )
 
         return jax.lax.map(one, alphas)
 
     found = np.asarray(log_evidence(np.append(ALPHAS, 0.2)))
-    w = NODE_WEIGHTS * ALPHAS * np.exp(found[:-1] - found.max()) * scipy.stats.lognorm.pdf(ALPHAS, 1.0)
+    w = (
+        NODE_WEIGHTS
+        * ALPHAS
+        * np.exp(found[:-1] - found.max())
+        * scipy.stats.lognorm.pdf(ALPHAS, 1.0)
+    )
     mean = np.sum(w * ALPHAS) / np.sum(w)
     return found[-1], np.sqrt(np.sum(w * (ALPHAS - mean) ** 2) / np.sum(w))
 
@@ -88,10 +101,14 @@ def test_frozen_flow(make):
         np.testing.assert_allclose(sd, 0.0916, atol=6e-5)
 
 
-# The flow itself. Spectral noise is the same noise for every number of points, so that two meshes share it.
+# The flow itself. Spectral noise is the same noise for every number of points, so that two meshes
+# share it.
 
 STEPS, BATCHES, PER_BATCH = 5, 4, 2
-LOG_AMPLITUDE, LOG_LENGTH = np.linspace(np.log(0.05), np.log(0.5), 6), np.linspace(np.log(0.3), np.log(1.7), 6)
+LOG_AMPLITUDE, LOG_LENGTH = (
+    np.linspace(np.log(0.05), np.log(0.5), 6),
+    np.linspace(np.log(0.3), np.log(1.7), 6),
+)
 GRID = np.stack(np.meshgrid(LOG_AMPLITUDE, LOG_LENGTH, indexing="ij"), -1).reshape(-1, 2)
 
 
@@ -109,7 +126,9 @@ def flow_log_weights(n):
     def run(grid, noise):
         def one(theta, z):
             amplitude, length = jnp.exp(theta)
-            flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length), noise=nb.SpectralNoise(4, period=8.0))
+            flow = nb.KunitaFlow(
+                space, nb.GaussianKernel(amplitude, length), noise=nb.SpectralNoise(4, period=8.0)
+            )
             seen = nb.InexactMatch(VARIANCE, normalised=False).at(v)
             return nb.GuidedBridge(flow, seen, x0=x0, ts=np.linspace(0, 1, STEPS + 1)).log_weight(z)
 
@@ -120,7 +139,9 @@ def flow_log_weights(n):
 
 
 def posterior(log_weights):
-    """Mean and SD of log amplitude and log length on the grid, (2,) each, from (parameters, particles)."""
+    """Mean and SD of log amplitude and log length on the grid, (2,) each, from (parameters,
+    particles).
+    """
     w = np.exp(log_weights - log_weights.max()).mean(1) * np.exp(log_prior(GRID))
     w /= w.sum()
     mean = w @ GRID
@@ -129,11 +150,17 @@ def posterior(log_weights):
 
 @pytest.mark.parametrize("coarse, fine", [(32, 128)])
 def test_flow(coarse, fine):
-    """Posterior means of amplitude and length move by less than 0.1 posterior SD, with the noise of four batches."""
+    """Posterior means of amplitude and length move by less than 0.1 posterior SD, with the noise of
+    four batches.
+    """
     first, second = flow_log_weights(coarse), flow_log_weights(fine)
-    (mean, sd, w), (fine_mean, _, _) = (posterior(x.reshape(len(GRID), -1)) for x in (first, second))
+    (mean, sd, w), (fine_mean, _, _) = (
+        posterior(x.reshape(len(GRID), -1)) for x in (first, second)
+    )
     shift = (fine_mean - mean) / sd
-    batches = np.array([(posterior(second[:, i])[0] - posterior(first[:, i])[0]) / sd for i in range(BATCHES)])
+    batches = np.array(
+        [(posterior(second[:, i])[0] - posterior(first[:, i])[0]) / sd for i in range(BATCHES)]
+    )
     error = batches.std(axis=0, ddof=1) / np.sqrt(BATCHES)
     border = w.reshape(6, 6)
     border = max(border[0].sum(), border[-1].sum(), border[:, 0].sum(), border[:, -1].sum())

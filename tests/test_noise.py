@@ -21,7 +21,9 @@ def flow(noise, kernel=KERNEL, n=3, dim=1, space=None):
 
 
 def bridge(sde, x, v=None, **kwargs):
-    return nb.GuidedBridge(sde, MATCH.at(x if v is None else v), x0=x, t1=1.0, num_steps=2, **kwargs)
+    return nb.GuidedBridge(
+        sde, MATCH.at(x if v is None else v), x0=x, t1=1.0, num_steps=2, **kwargs
+    )
 
 
 def spread(extent, dim=1, offset=0.0):
@@ -50,7 +52,9 @@ SPECTRAL = nb.SpectralNoise(30, period=PERIOD)
 
 @pytest.mark.parametrize("dim, extent", [(1, 2.0), (1, 3.9), (1, 4.6), (2, 4.6)])
 def test_wrap_around_is_the_error_of_the_covariance(dim, extent):
-    """Of the widest pair of points, where no mode is missing: exp(−(P − extent)²/4ℓ²), of a state and of a path."""
+    """Of the widest pair of points, where no mode is missing: exp(−(P − extent)²/4ℓ²), of a state
+    and of a path.
+    """
     sde = flow(SPECTRAL if dim == 1 else nb.SpectralNoise(10, period=PERIOD), dim=dim)
     x, right = spread(extent, dim), np.exp(-((PERIOD - extent) ** 2) / (4 * ELL**2))
     found = quiet(sde.noise_error, x)
@@ -64,7 +68,9 @@ def test_wrap_around_is_the_error_of_the_covariance(dim, extent):
 
 @pytest.mark.parametrize("margin", [3.0, 1.5, 0.5])
 def test_the_edge_of_a_box(margin):
-    """k² is a normal density of SD ℓ/√2: what lies beyond each side is lost. A coarse grid errs without an edge."""
+    """k² is a normal density of SD ℓ/√2: what lies beyond each side is lost. A coarse grid errs
+    without an edge.
+    """
     upper = 0.5 + margin * ELL
     x = spread(1.0)
     fine, coarse = flow(nb.GridNoise(-4.0, upper, 64)), flow(nb.GridNoise(-4.0, 6.0, 12))
@@ -74,7 +80,9 @@ def test_the_edge_of_a_box(margin):
     np.testing.assert_allclose(found["quadrature"], covariance_error(fine, x), rtol=0.05, atol=1e-6)
     found = quiet(coarse.noise_error, x)
     assert found["edge"] < 1e-3 < 0.02 < found["quadrature"]
-    diagonal = np.diag(np.asarray(coarse.covariance(0.0, jnp.asarray(x)))) / (0.09 * np.sqrt(np.pi) * ELL)
+    diagonal = np.diag(np.asarray(coarse.covariance(0.0, jnp.asarray(x)))) / (
+        0.09 * np.sqrt(np.pi) * ELL
+    )
     np.testing.assert_allclose(found["quadrature"], np.max(np.abs(diagonal - 1)), rtol=1e-9)
 
 
@@ -87,7 +95,9 @@ def test_noise_error_warns_above_one_percent():
     ):
         with pytest.warns(UserWarning, match=f"wrong by more than 1 % .*{name}"):
             sde.noise_error(x)
-    with pytest.raises(ValueError, match=r"`x` must be a state \(3, 1\) or a path of them; got \(2, 1\)"):
+    with pytest.raises(
+        ValueError, match=r"`x` must be a state \(3, 1\) or a path of them; got \(2, 1\)"
+    ):
         flow(SPECTRAL).noise_error(np.zeros((2, 1)))
 
 
@@ -122,7 +132,9 @@ def test_a_start_without_room_is_refused(name, sde, x, message):
     for use in (
         lambda: bridge(sde, x),
         lambda: nb.DiffusionEndpoint(sde, x, MATCH, t1=1.0, num_steps=2),
-        lambda: nb.simulate(sde, x, np.linspace(0, 1, 3), np.zeros((2, sde.noise_size(jnp.asarray(x)), x.shape[1]))),
+        lambda: nb.simulate(
+            sde, x, np.linspace(0, 1, 3), np.zeros((2, sde.noise_size(jnp.asarray(x)), x.shape[1]))
+        ),
     ):
         with pytest.raises(ValueError, match=f"`x0` does not fit the noise.*{message}"):
             use()
@@ -130,7 +142,9 @@ def test_a_start_without_room_is_refused(name, sde, x, message):
 
 @pytest.mark.parametrize("noise", ["spectral", "grid"])
 def test_room_is_not_asked_for_twice(noise):
-    """With room there is neither a warning nor an error, at any length scale for the default period."""
+    """With room there is neither a warning nor an error, at any length scale for the default
+    period.
+    """
     for ell in (0.2, 1.0, 5.0) if noise == "spectral" else (0.2, 0.6):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -155,7 +169,9 @@ def test_a_little_too_narrow_is_a_warning():
 
 
 def test_a_path_that_leaves_is_nan():
-    """From the first state beyond the box, or with half of a(x, x) through the image: at P − extent = 2ℓ √log 2."""
+    """From the first state beyond the box, or with half of a(x, x) through the image: at P − extent
+    = 2ℓ √log 2.
+    """
     half = PERIOD - 2 * ELL * np.sqrt(np.log(2))
     x, sde = spread(1.0), flow(SPECTRAL)
     with jax.disable_jit():

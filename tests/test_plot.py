@@ -29,7 +29,9 @@ def shapes():
 
 @pytest.fixture(scope="module")
 def paths(shapes):
-    """(7, 21, 12, 2): straight lines from one ellipse to another with noise that vanishes at both ends."""
+    """(7, 21, 12, 2): straight lines from one ellipse to another with noise that vanishes at both
+    ends.
+    """
     t = np.linspace(0.0, 1.0, 21)[:, None, None]
     noise = np.random.default_rng(0).normal(size=(7, 21, 12, 2))
     return (1.0 - t) * shapes.points[0] + t * shapes.points[3] + 0.1 * t * (1.0 - t) * noise
@@ -106,7 +108,10 @@ def flows(shapes):
     kernel, match = nb.GaussianKernel(0.5, 0.5), nb.InexactMatch(1e-3)
     bridges = {
         "points": nb.GuidedBridge(
-            nb.KunitaFlow(landmarks, kernel), match.at(target), x0=start, ts=np.linspace(0.0, 2.0, 9)
+            nb.KunitaFlow(landmarks, kernel),
+            match.at(target),
+            x0=start,
+            ts=np.linspace(0.0, 2.0, 9),
         ),
         "series": nb.GuidedBridge(
             nb.KunitaFlow(basis, kernel, noise="grid"),
@@ -115,14 +120,19 @@ def flows(shapes):
             ts=np.linspace(0.0, 2.0, 6),
         ),
     }
-    paths = {name: bridge.path(jr.normal(jr.key(0), bridge.noise_shape)) for name, bridge in bridges.items()}
+    paths = {
+        name: bridge.path(jr.normal(jr.key(0), bridge.noise_shape))
+        for name, bridge in bridges.items()
+    }
     return bridges, paths
 
 
 @pytest.mark.parametrize("scale", [None, 0.05])
 def test_score_frames(flows, shapes, tmp_path, scale):
     bridges, paths = flows
-    quivers = plot.score_frames(bridges, paths, [0.0, 0.8, 1.9], tmp_path / "frames.png", scale=scale)
+    quivers = plot.score_frames(
+        bridges, paths, [0.0, 0.8, 1.9], tmp_path / "frames.png", scale=scale
+    )
     assert (tmp_path / "frames.png").stat().st_size > 0 and not plt.get_fignums()
     drawn, lengths = [], []
     for line, (name, bridge) in zip(quivers, bridges.items(), strict=True):
@@ -142,7 +152,9 @@ def test_score_frames(flows, shapes, tmp_path, scale):
             assert np.all(corners > [x0, y0]) and np.all(corners < [x1, y1])
     np.testing.assert_allclose(drawn, drawn[0])  # one scale for all frames
     extent = max(np.ptp(quiver.get_offsets(), axis=0).max() for line in quivers for quiver in line)
-    assert drawn[0] == pytest.approx(scale) if scale else max(lengths) == pytest.approx(extent / 3.0)
+    assert (
+        drawn[0] == pytest.approx(scale) if scale else max(lengths) == pytest.approx(extent / 3.0)
+    )
     targets = [line[0].axes.collections[0].get_paths()[0].vertices[:-1] for line in quivers]
     np.testing.assert_allclose(targets[0], shapes.points[3])
     space = bridges["series"].sde.space
@@ -166,16 +178,26 @@ def test_score_frames_of_one_bridge(flows, tmp_path):
 def test_score_frames_errors(flows):
     bridges, paths = flows
     one, path = bridges["points"], paths["points"]
-    with pytest.raises(ValueError, match=r"`paths` must have the names of `bridges`, \['a'\]; got \['b'\]"):
+    with pytest.raises(
+        ValueError, match=r"`paths` must have the names of `bridges`, \['a'\]; got \['b'\]"
+    ):
         plot.score_frames({"a": one}, {"b": path}, [0.0], "never.png")
-    with pytest.raises(ValueError, match=r"`paths` must have a state for each .*\(9, 12, 2\); got \(5, 12, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"`paths` must have a state for each .*\(9, 12, 2\); got \(5, 12, 2\)"
+    ):
         plot.score_frames(one, path[:5], [0.0], "never.png")
-    with pytest.raises(ValueError, match=r"`times` must lie in \[0.0, 2.0\), before the end; got \[2.\]"):
+    with pytest.raises(
+        ValueError, match=r"`times` must lie in \[0.0, 2.0\), before the end; got \[2.\]"
+    ):
         plot.score_frames(one, path, 2.0, "never.png")
     with pytest.raises(ValueError, match="`paths` must lead to finite drifts"):
         plot.score_frames(one, np.asarray(path) * np.nan, 0.0, "never.png")
     line = nb.GuidedBridge(
-        nb.BrownianMotion(1.0), nb.InexactMatch(0.1).at([1.0, 2.0]), x0=[0.0, 1.0], t1=1.0, num_steps=2
+        nb.BrownianMotion(1.0),
+        nb.InexactMatch(0.1).at([1.0, 2.0]),
+        x0=[0.0, 1.0],
+        t1=1.0,
+        num_steps=2,
     )
     with pytest.raises(ValueError, match=r"`paths` must have the shape \(T, q, 2\), got \(1, 2\)"):
         plot.score_frames(line, np.zeros((3, 2)), 0.0, "never.png")
@@ -185,10 +207,15 @@ LADDER = nb.Tree.from_newick("((a:1,b:2)ab:1,c:4):1;")  # root, ab with its pare
 
 
 def drawn_on(ax, layer):
-    """Vertices of the shapes of one layer, in inches from the lower left corner of the figure, by their order."""
+    """Vertices of the shapes of one layer, in inches from the lower left corner of the figure, by
+    their order.
+    """
     ax.figure.canvas.draw()
     lines = [line for line in ax.collections if line.get_zorder() == layer]
-    points = [line.get_transform().transform([path.vertices for path in line.get_paths()][0]) for line in lines]
+    points = [
+        line.get_transform().transform([path.vertices for path in line.get_paths()][0])
+        for line in lines
+    ]
     return [inches / ax.figure.dpi for inches in points]
 
 
@@ -199,7 +226,10 @@ def test_tree():
     depths, rows = [0, 1, 2, 3, 4, 5], [-1.25, -1.25, -0.5, 0, -1, -2]
     drawn = np.stack([path.vertices for path in branches.get_paths()])
     above = [0, 1, 2, 2, 1]
-    corners = [[[depths[up], rows[up]], [depths[up], rows[i]], [depths[i], rows[i]]] for i, up in enumerate(above, 1)]
+    corners = [
+        [[depths[up], rows[up]], [depths[up], rows[i]], [depths[i], rows[i]]]
+        for i, up in enumerate(above, 1)
+    ]
     np.testing.assert_allclose(drawn, corners)
     assert [text.get_text() for text in ax.texts] == ["a", "b", "c"]
     assert [tuple(text.xy) for text in ax.texts] == [(3, 0), (4, -1), (5, -2)]
@@ -209,14 +239,20 @@ def test_tree():
 
 
 def test_tree_with_shapes(shapes):
-    """One scale for all shapes, tips beside their ends, inner nodes on them, with outlines of draws around."""
+    """One scale for all shapes, tips beside their ends, inner nodes on them, with outlines of draws
+    around.
+    """
     rng = np.random.default_rng(0)
     cloud = shapes.points[1] + 0.1 * rng.normal(size=(60, 12, 2))
     given = {"a": shapes.points[0], 5: shapes.points[3], "ab": shapes.points[1]}
-    branches = plot.tree(LADDER, shapes=given, draws={2: cloud, 0: cloud}, size=0.8, max_outlines=10)
+    branches = plot.tree(
+        LADDER, shapes=given, draws={2: cloud, 0: cloud}, size=0.8, max_outlines=10
+    )
     ax = branches.axes
     outlines = dict(zip([2, 0, 3, 5], drawn_on(ax, 4), strict=True))
-    at = {node: ax.transData.transform(xy) / ax.figure.dpi for node, xy in nodes_of(branches).items()}
+    at = {
+        node: ax.transData.transform(xy) / ax.figure.dpi for node, xy in nodes_of(branches).items()
+    }
     chosen = cloud[np.linspace(0, 59, 10).round().astype(int)]
     expected = {0: chosen.mean(axis=0), 2: given["ab"], 3: given["a"], 5: given[5]}
     extents = [np.ptp(points, axis=0) for points in (chosen.reshape(-1, 2), *expected.values())]
@@ -227,7 +263,11 @@ def test_tree_with_shapes(shapes):
         shift = on_paper[0] - scale * (outline - middle)[0]
         np.testing.assert_allclose(on_paper - shift, scale * (outline - middle), atol=1e-9)
         beside = shift[0] - scale * np.max(extents, axis=0)[0] / 2
-        assert np.allclose(shift, 0, atol=1e-9) if node in (0, 2) else beside > 0 and abs(shift[1]) < 1e-9
+        assert (
+            np.allclose(shift, 0, atol=1e-9)
+            if node in (0, 2)
+            else beside > 0 and abs(shift[1]) < 1e-9
+        )
     bands = [line for line in ax.collections if line.get_zorder() == 3]
     drawn = np.stack([path.vertices[:-1] for path in bands[0].get_paths()])
     middle = (given["ab"].min(0) + given["ab"].max(0)) / 2
@@ -242,11 +282,15 @@ def nodes_of(branches):
 
 
 def test_tree_of_arrays_on_given_axes(shapes):
-    """An array for all nodes is the same as shapes by number; a node without shape is NaN; a chain names its nodes."""
+    """An array for all nodes is the same as shapes by number; a node without shape is NaN; a chain
+    names its nodes.
+    """
     figure, axes = plt.subplots(2)
     chain = nb.Tree.chain([1.0, 3.0], names=["young", "old"])
     several = np.stack([np.full((12, 2), np.nan), shapes.points[0], shapes.points[1]])
-    first = plot.tree(chain, axes[0], shapes=several, draws=np.stack([several, several]), closed=False)
+    first = plot.tree(
+        chain, axes[0], shapes=several, draws=np.stack([several, several]), closed=False
+    )
     plot.tree(chain, axes[1], shapes={"young": several[1], 2: several[2]}, closed=False)
     assert first.axes is axes[0] and len(plt.get_fignums()) == 1
     whole, by_name = drawn_on(axes[0], 4), drawn_on(axes[1], 4)
@@ -258,11 +302,17 @@ def test_tree_of_arrays_on_given_axes(shapes):
 
 def test_tree_errors(shapes):
     point = shapes.points[0]
-    with pytest.raises(ValueError, match=r"`shapes` must be given by names of nodes, .* from 0 to 5; got 'd'"):
+    with pytest.raises(
+        ValueError, match=r"`shapes` must be given by names of nodes, .* from 0 to 5; got 'd'"
+    ):
         plot.tree(LADDER, shapes={"d": point})
-    with pytest.raises(ValueError, match=r"`draws\['a'\]` must have the shape \(S, n, 2\), got \(12, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"`draws\['a'\]` must have the shape \(S, n, 2\), got \(12, 2\)"
+    ):
         plot.tree(LADDER, draws={"a": point})
-    with pytest.raises(ValueError, match=r"`shapes` must have the shape \(num_nodes, n, 2\) with 6 nodes, got \(4"):
+    with pytest.raises(
+        ValueError, match=r"`shapes` must have the shape \(num_nodes, n, 2\) with 6 nodes, got \(4"
+    ):
         plot.tree(LADDER, shapes=shapes.points)
     with pytest.raises(ValueError, match="`size` must be a positive number of inches; got 0"):
         plot.tree(LADDER, size=0)
@@ -282,9 +332,15 @@ def test_posterior():
     before, posterior = (areas[0].axes.lines[i].get_xydata().T for i in range(2))
     after = areas[1].axes.lines[0].get_xydata().T
     # A kernel estimate from 4000 draws has a standard error of about 0.01 here.
-    np.testing.assert_allclose(posterior[1], np.exp(-(posterior[0] ** 2) / 2.0) / np.sqrt(2.0 * np.pi), atol=0.04)
-    np.testing.assert_allclose(before[1], np.exp(-(before[0] ** 2) / 18.0) / np.sqrt(18.0 * np.pi), atol=0.015)
-    np.testing.assert_allclose(after[1], np.exp(-(after[0] ** 2) / 2.0) * np.sqrt(2.0 / np.pi), atol=0.09)
+    np.testing.assert_allclose(
+        posterior[1], np.exp(-(posterior[0] ** 2) / 2.0) / np.sqrt(2.0 * np.pi), atol=0.04
+    )
+    np.testing.assert_allclose(
+        before[1], np.exp(-(before[0] ** 2) / 18.0) / np.sqrt(18.0 * np.pi), atol=0.015
+    )
+    np.testing.assert_allclose(
+        after[1], np.exp(-(after[0] ** 2) / 2.0) * np.sqrt(2.0 / np.pi), atol=0.09
+    )
     assert after[0].min() == 0.0
     for grid, density in (posterior, after):
         step = grid[1] - grid[0]
@@ -303,21 +359,31 @@ def test_posterior_of_equal_draws_on_given_axes():
 
 def test_errors(shapes, paths):
     points = shapes.points[0]
-    with pytest.raises(ValueError, match=r"`shapes` must have the shape \(n, 2\) or \(N, n, 2\), got \(5, 3\).*:2"):
+    with pytest.raises(
+        ValueError, match=r"`shapes` must have the shape \(n, 2\) or \(N, n, 2\), got \(5, 3\).*:2"
+    ):
         plot.outlines(np.ones((5, 3)))
-    with pytest.raises(ValueError, match=r"`path` must have the shape \(K \+ 1, n, 2\), got \(12, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"`path` must have the shape \(K \+ 1, n, 2\), got \(12, 2\)"
+    ):
         plot.path(points)
-    with pytest.raises(ValueError, match=r"`ts` must have the shape \(21,\), one time for each state, got \(4,\)"):
+    with pytest.raises(
+        ValueError, match=r"`ts` must have the shape \(21,\), one time for each state, got \(4,\)"
+    ):
         plot.path(paths[0], ts=np.arange(4.0))
     with pytest.raises(ValueError, match=r"`paths` must have the shape \(S, K \+ 1, n, 2\)"):
         plot.bridge_fan(paths[0], points, points)
-    with pytest.raises(ValueError, match=r"`arrows` must have the shape of `points` \(12, 2\), got \(3, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"`arrows` must have the shape of `points` \(12, 2\), got \(3, 2\)"
+    ):
         plot.score_field(points, points[:3])
     with pytest.raises(ValueError, match="at least one scalar parameter"):
         plot.posterior({"noise": np.ones((4, 2))})
     with pytest.raises(ValueError, match=r"`samples\['a'\]` must be finite"):
         plot.posterior({"a": np.array([1.0, np.nan])})
-    with pytest.raises(ValueError, match=r"`axes` must be as many as the parameters \['a', 'b'\], got 1"):
+    with pytest.raises(
+        ValueError, match=r"`axes` must be as many as the parameters \['a', 'b'\], got 1"
+    ):
         plot.posterior({"a": np.arange(3.0), "b": np.arange(3.0)}, axes=plt.subplots()[1])
 
 
@@ -340,7 +406,9 @@ def test_without_matplotlib(monkeypatch, shapes):
 
 
 def test_deformation(shapes):
-    """A grid of a known path: as `carry` has it, coloured by the area of its cells; the outlines of start and end."""
+    """A grid of a known path: as `carry` has it, coloured by the area of its cells; the outlines of
+    start and end.
+    """
     flow = nb.KunitaFlow(nb.Landmarks(12, 2), nb.GaussianKernel(0.3, 0.8))
     path = np.linspace(shapes.points[0], shapes.points[3], 6)
     mesh = plot.deformation(flow, path, num_lines=8, margin=0.5)
@@ -348,13 +416,20 @@ def test_deformation(shapes):
     area = np.asarray(mesh.get_array()).reshape(corners.shape[:2])
     low, high = path[0].min(axis=0), path[0].max(axis=0)
     reach = 0.5 * (high - low).max()
-    np.testing.assert_allclose(corners[0, 0], flow.carry(path, (low - reach)[None])[-1, 0], atol=1e-10)
-    np.testing.assert_allclose(corners[-1, -1], flow.carry(path, (high + reach)[None])[-1, 0], atol=1e-10)
+    np.testing.assert_allclose(
+        corners[0, 0], flow.carry(path, (low - reach)[None])[-1, 0], atol=1e-10
+    )
+    np.testing.assert_allclose(
+        corners[-1, -1], flow.carry(path, (high + reach)[None])[-1, 0], atol=1e-10
+    )
     sides = (high - low + 2 * reach) / (np.array(area.shape) - 1)
-    one, other = corners[1:, 1:] - corners[:-1, :-1], corners[:-1, 1:] - corners[1:, :-1]  # diagonals
+    # diagonals
+    one, other = corners[1:, 1:] - corners[:-1, :-1], corners[:-1, 1:] - corners[1:, :-1]
     cells = (one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]) / 2 / np.prod(sides)
     at_corners = 2.0**area
-    mean = (at_corners[1:, 1:] + at_corners[1:, :-1] + at_corners[:-1, 1:] + at_corners[:-1, :-1]) / 4
+    mean = (
+        at_corners[1:, 1:] + at_corners[1:, :-1] + at_corners[:-1, 1:] + at_corners[:-1, :-1]
+    ) / 4
     np.testing.assert_allclose(cells, mean, rtol=0.02)
     assert mesh.get_clim()[1] == pytest.approx(np.abs(area).max()) and np.ptp(area) > 0.3
     drawn = [line.vertices for lines in mesh.axes.collections[-2:] for line in lines.get_paths()]

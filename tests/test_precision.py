@@ -1,7 +1,8 @@
 """Single precision, large time origins, and times between those of the grid.
 
-Where the guide is exact, every log weight is log p(v | x0), known from the dense Gaussian in double precision: in
-single precision neither its spread over the noise nor its error may grow with the steps, the states or the time origin.
+Where the guide is exact, every log weight is log p(v | x0), known from the dense Gaussian in double
+precision: in single precision neither its spread over the noise nor its error may grow with the
+steps, the states or the time origin.
 """
 
 import jax
@@ -17,15 +18,22 @@ from numpyro_bridges.sdes import time_grid
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
 B, SIGMA = np.array([[-0.5, 0.4], [-0.2, -0.8]]), np.array([[0.5, 0.1], [0.0, 0.4]])
-CHAIN, PUSH, FIRST = np.array([[0.0, 1.0], [0.0, -1.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
+CHAIN, PUSH, FIRST = (
+    np.array([[0.0, 1.0], [0.0, -1.0]]),
+    np.array([[0.0], [1.0]]),
+    np.array([[1.0, 0.0]]),
+)
 SIZES = np.array([1.0, 1e4], np.float32)
 
 
 def euler(size):
-    return nb.SDE(lambda t, x, shift: jnp.asarray(B, x.dtype) @ x + shift, lambda t, x, _: SIGMA, 0.3 * size)
+    return nb.SDE(
+        lambda t, x, shift: jnp.asarray(B, x.dtype) @ x + shift, lambda t, x, _: SIGMA, 0.3 * size
+    )
 
 
-STILL = nb.SDE(lambda t, x, _: -jnp.sin(x), lambda t, x, _: 0.5 + 0.1 * jnp.cos(x))  # whatever the time
+# whatever the time
+STILL = nb.SDE(lambda t, x, _: -jnp.sin(x), lambda t, x, _: 0.5 + 0.1 * jnp.cos(x))
 
 # name: drift, diffusion, shift at size 1, what is seen, the SDE at a size
 KINDS = {
@@ -63,7 +71,9 @@ def law_of_the_end(kind, size, x0, ts):
     ],
 )
 def test_constant_log_weights(kind, exact, num_steps):
-    """Sizes and variances in one program, both grids in it; an error of 2 % of a standard deviation would be seen."""
+    """Sizes and variances in one program, both grids in it; an error of 2 % of a standard deviation
+    would be seen.
+    """
     *_, operator, make = KINDS[kind]
     L = np.eye(2) if operator is None else operator
     x0 = SIZES[:, None] * np.array([1.0, 0.5], np.float32)
@@ -79,12 +89,20 @@ def test_constant_log_weights(kind, exact, num_steps):
         program = jax.jit(jax.vmap(over_sizes, (None, None, 0, 0, None)))
         for graded in (True, False):
             grid = time_grid(0.0, 1.0, num_steps, None, graded=graded)
-            laws = [law_of_the_end(kind, *start, np.asarray(grid)) for start in zip(SIZES, x0, strict=True)]
+            laws = [
+                law_of_the_end(kind, *start, np.asarray(grid))
+                for start in zip(SIZES, x0, strict=True)
+            ]
             noises = [np.zeros(())] if exact else VARIANCES
-            totals = [[L @ C @ L.T + float(noise) * np.eye(len(L)) for _, C in laws] for noise in noises]
+            totals = [
+                [L @ C @ L.T + float(noise) * np.eye(len(L)) for _, C in laws] for noise in noises
+            ]
             v = np.stack(
                 [
-                    [(L @ m)[:, 0] + 0.7 * np.sqrt(np.diag(S)) for (m, _), S in zip(laws, row, strict=True)]
+                    [
+                        (L @ m)[:, 0] + 0.7 * np.sqrt(np.diag(S))
+                        for (m, _), S in zip(laws, row, strict=True)
+                    ]
                     for row in totals
                 ]
             ).astype(np.float32)
@@ -113,7 +131,9 @@ def test_ends_to_the_last_digit(seen):
         if seen == "set":
             assert np.all((path[-1][:2] >= box.lower) & (path[-1][:2] <= box.upper))
         else:
-            assert np.array_equal(path[-1][mask] if seen == "mask" else path[-1], np.asarray(condition.observed))
+            assert np.array_equal(
+                path[-1][mask] if seen == "mask" else path[-1], np.asarray(condition.observed)
+            )
 
 
 # Time origins.
@@ -123,15 +143,21 @@ LATE = 1e9 + 0.25  # seconds since 1970, in 2001
 
 
 def shifted_bridge(sde, t0, t1, **settings):
-    return nb.GuidedBridge(sde, nb.ExactMatch().at([0.4, 0.1]), x0=[0.2, 0.3], t0=t0, t1=t1, num_steps=5, **settings)
+    return nb.GuidedBridge(
+        sde, nb.ExactMatch().at([0.4, 0.1]), x0=[0.2, 0.3], t0=t0, t1=t1, num_steps=5, **settings
+    )
 
 
 def test_the_time_origin_makes_no_difference_to_an_autonomous_sde():
-    """The same numbers bit by bit: grid, weights, free paths, log h̃ between grid times. Times stay the user's."""
+    """The same numbers bit by bit: grid, weights, free paths, log h̃ between grid times. Times stay
+    the user's.
+    """
     with jax.enable_x64(False), jax.disable_jit():
         early, late = shifted_bridge(STILL, 0.0, 2.0), shifted_bridge(STILL, LATE, LATE + 2.0)
         assert np.array_equal(early.grid.elapsed, late.grid.elapsed)
-        np.testing.assert_allclose(np.asarray(late.ts, float), LATE + np.asarray(early.ts, float), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(
+            np.asarray(late.ts, float), LATE + np.asarray(early.ts, float), rtol=0, atol=1e-6
+        )
         z = jr.normal(jr.key(0), early.noise_shape)
         assert early.log_weight(z) == late.log_weight(z)
         moved = late.with_guide(nb.FrozenGuide())
@@ -140,13 +166,18 @@ def test_the_time_origin_makes_no_difference_to_an_autonomous_sde():
         ts = np.array([0.0, 0.5, 2.0])
         paths = [nb.simulate(STILL, jnp.array([0.2, 0.3]), t0 + ts, z[:2]) for t0 in (0.0, LATE)]
         assert np.array_equal(*paths)
-        laws = [nb.DiffusionEndpoint(STILL, [0.2, 0.3], nb.InexactMatch(0.1), ts=t0 + ts) for t0 in (0.0, LATE)]
+        laws = [
+            nb.DiffusionEndpoint(STILL, [0.2, 0.3], nb.InexactMatch(0.1), ts=t0 + ts)
+            for t0 in (0.0, LATE)
+        ]
         assert np.array_equal(*(law.sample(jr.key(1)) for law in laws))
         assert np.array_equal(np.asarray(laws[1].parts["ts"]), LATE + ts)
 
 
 def test_an_sde_that_depends_on_the_time_sees_it():
-    """dX = sin t dt + σ dW, Euler steps of the user's clock: v ~ N(x0 + Σ dt sin t, σ² T), for every noise."""
+    """dX = sin t dt + σ dW, Euler steps of the user's clock: v ~ N(x0 + Σ dt sin t, σ² T), for
+    every noise.
+    """
     for t0 in (3.0, 1e5):
         bridge = shifted_bridge(SEASONAL, t0, t0 + 2.0)
         with jax.disable_jit():
@@ -169,18 +200,36 @@ def free(ts, x0=(0.0,)):
 @pytest.mark.parametrize(
     "build, message",
     [
-        (lambda: shifted_bridge(SEASONAL, LATE, LATE + 2.0), "`t0` must leave.*depends on the time.*64.0 apart.*x64"),
-        (lambda: brownian(t1=1.0, num_steps=10_000), "`num_steps` must leave steps.*float32 are .*e-07 apart.*x64"),
-        (lambda: brownian(ts=[0.0, 1.0, 1.0 + 1e-9]), "`ts` must leave steps that can be told apart.*fewer steps"),
+        (
+            lambda: shifted_bridge(SEASONAL, LATE, LATE + 2.0),
+            "`t0` must leave.*depends on the time.*64.0 apart.*x64",
+        ),
+        (
+            lambda: brownian(t1=1.0, num_steps=10_000),
+            "`num_steps` must leave steps.*float32 are .*e-07 apart.*x64",
+        ),
+        (
+            lambda: brownian(ts=[0.0, 1.0, 1.0 + 1e-9]),
+            "`ts` must leave steps that can be told apart.*fewer steps",
+        ),
         (lambda: free([0.0, 1.0, 1.0 + 1e-9]), "`ts` must leave"),
         (lambda: free(None), "`ts` must be a number"),
         (lambda: free([0.0, 1.0, 2.0], 1.0), r"`x0` must be one state.*got shape \(\)"),
-        (lambda: brownian(ts=[1.0, 2.0], t0=0.0), r"`ts` must begin at `t0`; got ts\[0\] = 1.0 and t0 = 0.0"),
+        (
+            lambda: brownian(ts=[1.0, 2.0], t0=0.0),
+            r"`ts` must begin at `t0`; got ts\[0\] = 1.0 and t0 = 0.0",
+        ),
         (lambda: brownian(ts=[0.0, 1.0], t1="1"), "`t1` must be a number"),
         (lambda: brownian(ts=[0.0, 1.0], t0="0"), "`t0` must be a number"),
         (lambda: brownian(t1=1.0, num_steps=2).log_h(None, [0.0]), "`t` must be a number"),
-        (lambda: brownian(t1=1.0, num_steps=2).log_h(1.0, [0.0]), r"`t` must lie in \[0.0, 1.0\), before the end"),
-        (lambda: brownian(t1=1.0, num_steps=2).score(np.zeros(2), [0.0]), r"`t` must be one time; got shape \(2,\)"),
+        (
+            lambda: brownian(t1=1.0, num_steps=2).log_h(1.0, [0.0]),
+            r"`t` must lie in \[0.0, 1.0\), before the end",
+        ),
+        (
+            lambda: brownian(t1=1.0, num_steps=2).score(np.zeros(2), [0.0]),
+            r"`t` must be one time; got shape \(2,\)",
+        ),
     ],
 )
 def test_refused_times(build, message):
@@ -201,7 +250,9 @@ def test_what_double_precision_represents_is_accepted():
 
 @pytest.mark.parametrize("kind", ["brownian", "scalar", "dense"])
 def test_log_h_between_grid_times(kind):
-    """The law from x over the time that is left, dense; derivatives by t and x from central differences of that."""
+    """The law from x over the time that is left, dense; derivatives by t and x from central
+    differences of that.
+    """
     drift, diffusion, shift, _, make = KINDS[kind]
     x, v, h = np.array([0.3, -0.2]), np.array([[0.5], [0.1]]), 1e-5
 
@@ -219,12 +270,16 @@ def test_log_h_between_grid_times(kind):
     times = np.array([0.01, 0.2, 0.5, 0.9])  # one of them is on the grid
     for t, value, by_time, score in zip(times, *map(np.asarray, found(times)), strict=True):
         np.testing.assert_allclose(value, truth(t, x), rtol=1e-10)
-        np.testing.assert_allclose(by_time, (truth(t + h, x) - truth(t - h, x)) / (2 * h), rtol=1e-6)
+        np.testing.assert_allclose(
+            by_time, (truth(t + h, x) - truth(t - h, x)) / (2 * h), rtol=1e-6
+        )
         slopes = [(truth(t, x + h * e) - truth(t, x - h * e)) / (2 * h) for e in np.eye(2)]
         np.testing.assert_allclose(score, slopes, rtol=1e-7)
 
 
-@pytest.mark.parametrize("guide", [nb.RecedingGuide(), nb.FrozenGuide(nb.LinearSDE(-0.3, 0.6, 0.1))])
+@pytest.mark.parametrize(
+    "guide", [nb.RecedingGuide(), nb.FrozenGuide(nb.LinearSDE(-0.3, 0.6, 0.1))]
+)
 def test_log_h_is_that_of_the_bridge_from_there(guide):
     """A bridge that starts at (t, x), on what is left of the grid."""
     ts, x = np.array([0.0, 0.4, 0.7, 1.0]), jnp.array([0.3, -0.2])
@@ -244,7 +299,9 @@ def test_the_density_by_the_end_time():
     """∂/∂t1 of log N(v; x0 e^{−γ t1}, …), the time traced."""
 
     def log_weight(t1):
-        bridge = nb.GuidedBridge(nb.LinearSDE(-0.5, 0.7), nb.ExactMatch().at([0.4]), x0=[1.0], t1=t1, num_steps=3)
+        bridge = nb.GuidedBridge(
+            nb.LinearSDE(-0.5, 0.7), nb.ExactMatch().at([0.4]), x0=[1.0], t1=t1, num_steps=3
+        )
         return bridge.log_weight(jr.normal(jr.key(0), bridge.noise_shape))
 
     def truth(t):
@@ -261,10 +318,26 @@ def test_the_density_by_the_end_time():
 @pytest.mark.parametrize(
     "condition, path, message",
     [
-        (nb.InexactMatch(0.1).at([0.1, 0.2]), np.ones((4, 2)), "`path` must start at `x0`; its first state is 1.0"),
-        (nb.ExactMatch().at([0.1, 0.2]), np.zeros((4, 2)), "`path` must end where `condition` is met.*0.2 away"),
-        (nb.ExactMatch([[1.0, 1.0]]).at([0.1]), np.zeros((4, 2)), "`path` must end where `condition` is met"),
-        (nb.CylinderSet([0.1], [1.0]), np.zeros((4, 2)), "`path` must end where `condition` is met.*0.1 away"),
+        (
+            nb.InexactMatch(0.1).at([0.1, 0.2]),
+            np.ones((4, 2)),
+            "`path` must start at `x0`; its first state is 1.0",
+        ),
+        (
+            nb.ExactMatch().at([0.1, 0.2]),
+            np.zeros((4, 2)),
+            "`path` must end where `condition` is met.*0.2 away",
+        ),
+        (
+            nb.ExactMatch([[1.0, 1.0]]).at([0.1]),
+            np.zeros((4, 2)),
+            "`path` must end where `condition` is met",
+        ),
+        (
+            nb.CylinderSet([0.1], [1.0]),
+            np.zeros((4, 2)),
+            "`path` must end where `condition` is met.*0.1 away",
+        ),
     ],
 )
 def test_a_path_of_another_bridge_is_refused(condition, path, message):
@@ -275,7 +348,9 @@ def test_a_path_of_another_bridge_is_refused(condition, path, message):
 
 def test_a_path_kept_in_single_precision_is_not():
     condition = nb.ExactMatch().at([1.0 / 3, 200.1])
-    bridge = nb.GuidedBridge(nb.BrownianMotion(0.5), condition, x0=[0.1, 200.0], t1=1.0, num_steps=3)
+    bridge = nb.GuidedBridge(
+        nb.BrownianMotion(0.5), condition, x0=[0.1, 200.0], t1=1.0, num_steps=3
+    )
     with jax.disable_jit():
         path = bridge.path(jr.normal(jr.key(0), bridge.noise_shape)).astype(np.float32)
         assert np.all(np.isfinite(bridge.noise_from_path(path)))

@@ -1,8 +1,8 @@
 """The reference values: closed forms, and long runs by other means of nonlinear bridges.
 
-Closed forms are typed here again and agree with the printed digits of the table. Where the value is that of the
-continuous process and the model takes Euler steps, a test states its allowance for the discretisation, in units of
-1/num_steps, and runs at two numbers of steps, one twice the other.
+Closed forms are typed here again and agree with the printed digits of the table. Where the value is
+that of the continuous process and the model takes Euler steps, a test states its allowance for the
+discretisation, in units of 1/num_steps, and runs at two numbers of steps, one twice the other.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,9 @@ import numpyro_bridges as nb
 
 def ou_log_density(rate, mean, sigma, x0, v, t):
     center = mean + np.exp(-rate * t) * (x0 - mean)
-    return scipy.stats.norm.logpdf(v, center, sigma * np.sqrt(-np.expm1(-2 * rate * t) / (2 * rate)))
+    return scipy.stats.norm.logpdf(
+        v, center, sigma * np.sqrt(-np.expm1(-2 * rate * t) / (2 * rate))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,9 @@ def ou():
     @jax.jit
     def log_weights(rate, mean, sigma, x0, v, t):
         sde = nb.LinearSDE(-rate, sigma, rate * mean)
-        bridge = nb.GuidedBridge(sde, nb.ExactMatch().at([v]), x0=jnp.array([x0]), t1=t, num_steps=5)
+        bridge = nb.GuidedBridge(
+            sde, nb.ExactMatch().at([v]), x0=jnp.array([x0]), t1=t, num_steps=5
+        )
         return jax.vmap(bridge.log_weight)(jr.normal(jr.key(0), (4, 5, 1, 1)))
 
     return log_weights
@@ -68,7 +72,9 @@ def test_hypo_elliptic_linear_process():
     t, x0, v = 1.5, np.array([2.0, 1.0]), 2.5
     u, w = np.polynomial.legendre.leggauss(40)
     flows = [scipy.linalg.expm(B * t * (1 + s) / 2) for s in u]
-    mean = scipy.linalg.expm(B * t) @ x0 + sum(0.5 * t * wi * E @ beta for wi, E in zip(w, flows, strict=True))
+    mean = scipy.linalg.expm(B * t) @ x0 + sum(
+        0.5 * t * wi * E @ beta for wi, E in zip(w, flows, strict=True)
+    )
     S = sum(0.5 * t * wi * E @ sigma @ sigma.T @ E.T for wi, E in zip(w, flows, strict=True))
     truth = scipy.stats.norm.logpdf(v, mean[0], np.sqrt(S[0, 0] + 0.1))
     np.testing.assert_allclose(truth, -0.992611, atol=5.1e-7)
@@ -112,7 +118,9 @@ def log_kernel(n, alphas, variance):
 
 @pytest.fixture(scope="module")
 def curve_evidence():
-    """The log evidence as a function of n, the amplitudes and the variance; one compilation for each n."""
+    """The log evidence as a function of n, the amplitudes and the variance; one compilation for
+    each n.
+    """
     compiled = {}
 
     def evidence(n, alphas, variance):
@@ -125,13 +133,17 @@ def curve_evidence():
             bridge = nb.GuidedBridge(sde, seen, x0=x0, ts=np.linspace(0, 1, 2))
             return bridge.log_weight(jnp.ones((1, n, 2)))
 
-        run = compiled.setdefault(n, jax.jit(lambda a, s: jax.lax.map(lambda alpha: one(alpha, s), a)))
+        run = compiled.setdefault(
+            n, jax.jit(lambda a, s: jax.lax.map(lambda alpha: one(alpha, s), a))
+        )
         return np.asarray(run(alphas, variance))
 
     return evidence
 
 
-@pytest.mark.parametrize("n, table", [(8, -5.714164), (16, -5.716044), (64, -5.716044), (256, -5.716044)])
+@pytest.mark.parametrize(
+    "n, table", [(8, -5.714164), (16, -5.716044), (64, -5.716044), (256, -5.716044)]
+)
 def test_brownian_motion_on_curves(curve_evidence, n, table):
     truth = log_kernel(n, np.array([0.2]), VARIANCE)
     np.testing.assert_allclose(truth, table, atol=5.1e-7)
@@ -147,7 +159,8 @@ def sd(log_density):
 
 @pytest.mark.parametrize("n, shrunk", [(16, 0.046), (64, 0.037), (256, 0.031)])
 def test_spread_of_the_amplitude(curve_evidence, n, shrunk):
-    """With the H-norm the same posterior for every n; with a fixed variance per landmark it shrinks.
+    """With the H-norm the same posterior for every n; with a fixed variance per landmark it
+    shrinks.
 
     The flat prior is that on α > 0: an interval that leaves out α < 0.001 gives 0.1015.
     """
@@ -162,7 +175,9 @@ def test_spread_of_the_amplitude(curve_evidence, n, shrunk):
 def test_kunita_covariance():
     alpha, length = 0.3, 0.7
     x, _ = circle_and_datum(5)
-    flow = nb.KunitaFlow(nb.Landmarks(5, 2), nb.GaussianKernel(alpha, length), noise=nb.LandmarkNoise(jitter=0.0))
+    flow = nb.KunitaFlow(
+        nb.Landmarks(5, 2), nb.GaussianKernel(alpha, length), noise=nb.LandmarkNoise(jitter=0.0)
+    )
     square = np.sum((x[:, None] - x[None]) ** 2, -1)
     expected = alpha**2 * np.pi * length**2 * np.exp(-square / (4 * length**2))
     np.testing.assert_allclose(flow.covariance(0.0, jnp.asarray(x)), expected, rtol=1e-12)
@@ -175,7 +190,8 @@ COUNT = 10_000
 
 @dataclass(frozen=True)
 class Case:
-    """`table`: number of steps to (value, its standard error or rounding) where the value is that of the Euler model.
+    """`table`: number of steps to (value, its standard error or rounding) where the value is that
+    of the Euler model.
 
     `limit`: (value, its error, allowance times the number of steps) of the continuous process.
     """
@@ -212,7 +228,9 @@ def radial_log_density(theta, x0, x, t):
 
 
 def gbm_log_density(mu, sigma, x0, x, t):
-    return scipy.stats.norm.logpdf(np.log(x), np.log(x0) + (mu - sigma**2 / 2) * t, sigma * np.sqrt(t)) - np.log(x)
+    return scipy.stats.norm.logpdf(
+        np.log(x), np.log(x0) + (mu - sigma**2 / 2) * t, sigma * np.sqrt(t)
+    ) - np.log(x)
 
 
 def switch(y):
@@ -293,31 +311,43 @@ def check_estimate(log_evidence, error, pareto_k, case, num_steps):
         assert abs(log_evidence - value) < 3 * np.hypot(error, own) + allowance / num_steps
 
 
-@pytest.mark.parametrize("name, num_steps", [(name, k) for name, case in CASES.items() for k in case.steps])
+@pytest.mark.parametrize(
+    "name, num_steps", [(name, k) for name, case in CASES.items() for k in case.steps]
+)
 def test_nonlinear_bridge(name, num_steps):
     case = CASES[name]
-    found = nb.estimate_evidence(case.bridge(num_steps), jr.key(0), case.count, batch_size=case.count)
-    check_estimate(float(found.log_evidence), float(found.standard_error), found.pareto_k, case, num_steps)
+    found = nb.estimate_evidence(
+        case.bridge(num_steps), jr.key(0), case.count, batch_size=case.count
+    )
+    check_estimate(
+        float(found.log_evidence), float(found.standard_error), found.pareto_k, case, num_steps
+    )
 
 
 def test_closed_forms_have_the_printed_digits():
     np.testing.assert_allclose(CASES["radial"].limit[0], -2.525135, atol=5.1e-7)
     np.testing.assert_allclose(CASES["geometric"].limit[0], -0.872436, atol=5.1e-7)
     for theta in (2.0, 4.0):  # the closed form is a density
-        total = scipy.integrate.quad(lambda x, a=theta: np.exp(radial_log_density(a, 1.5, x, 1.0)), 1e-9, 12)[0]
+        total = scipy.integrate.quad(
+            lambda x, a=theta: np.exp(radial_log_density(a, 1.5, x, 1.0)), 1e-9, 12
+        )[0]
         np.testing.assert_allclose(total, 1.0, rtol=1e-7)
 
 
 def test_a_poor_auxiliary_misses_the_evidence_and_shows_it():
     case = CASES["cell"]
-    poor = case.bridge(400).with_guide(nb.FrozenGuide(nb.LinearSDE(-1.0, 0.1, np.array([1.0, 1.0]))))
+    poor = case.bridge(400).with_guide(
+        nb.FrozenGuide(nb.LinearSDE(-1.0, 0.1, np.array([1.0, 1.0])))
+    )
     found = nb.estimate_evidence(poor, jr.key(0), case.count, batch_size=case.count)
     assert found.log_evidence < 1.43 - 20
     assert found.pareto_k > 0.7 and found.ess < 0.01 * case.count
 
 
 def test_exact_end_with_the_covariance_of_the_start():
-    """ã = a(x0) is no auxiliary for the continuous weight of an exactly seen end, and is refused there."""
+    """ã = a(x0) is no auxiliary for the continuous weight of an exactly seen end, and is refused
+    there.
+    """
     case = CASES["geometric"]
     with pytest.raises(ValueError, match="must match the SDE at the observed end"):
         nb.GuidedBridge(
@@ -334,7 +364,9 @@ def test_exact_end_with_the_covariance_of_the_start():
 
 
 def chain(mean, sd, grid):
-    """One step from every point of the grid: the points within 6 SD of its mean, and their probabilities."""
+    """One step from every point of the grid: the points within 6 SD of its mean, and their
+    probabilities.
+    """
     width = grid[1] - grid[0]
     reach = int(np.ceil(6 * np.max(sd) / width))
     near = np.round((mean - grid[0]) / width).astype(int)[:, None] + np.arange(-reach, reach + 1)
@@ -377,9 +409,16 @@ def weighted_paths(bridge, count, index):
         return jax.vmap(one)(jr.normal(key, (count, *bridge.noise_shape)))
 
     states, log_weights = run(jr.key(0))
-    log_evidence, error = nb.weights.log_mean_exp(log_weights), nb.weights.standard_error(log_weights)
+    log_evidence, error = (
+        nb.weights.log_mean_exp(log_weights),
+        nb.weights.standard_error(log_weights),
+    )
     weights = np.exp(np.asarray(log_weights - log_evidence))
-    return np.asarray(states), weights, (float(log_evidence), float(error), float(nb.weights.pareto_k(log_weights)))
+    return (
+        np.asarray(states),
+        weights,
+        (float(log_evidence), float(error), float(nb.weights.pareto_k(log_weights))),
+    )
 
 
 def weighted_mean(f, weights):
@@ -401,9 +440,13 @@ QUANTILES = {0.05: 0.171, 0.25: 0.590, 0.5: 0.826, 0.75: 0.938, 0.95: 1.189}
 
 @pytest.mark.parametrize("num_steps", SINE.steps)
 def test_sine_bridge(num_steps):
-    """Evidence and the multimodal law at mid-time; allowances 6 / num_steps in nats, 1 / num_steps for the law."""
+    """Evidence and the multimodal law at mid-time; allowances 6 / num_steps in nats, 1 / num_steps
+    for the law.
+    """
     dt, grid = 1 / num_steps, np.arange(-1.5, 4, 0.008)
-    step = chain(grid + dt * (2 - 2 * np.sin(8 * grid)), np.full(len(grid), 0.5 * np.sqrt(dt)), grid)
+    step = chain(
+        grid + dt * (2 - 2 * np.sin(8 * grid)), np.full(len(grid), 0.5 * np.sqrt(dt)), grid
+    )
     p = scipy.stats.norm.pdf(grid, 2 * dt, 0.5 * np.sqrt(dt)) * 0.008
     f = scipy.stats.norm.pdf(np.pi / 2, grid + dt * (2 - 2 * np.sin(8 * grid)), 0.5 * np.sqrt(dt))
     for _ in range(num_steps // 2 - 1):
@@ -431,7 +474,9 @@ def test_sine_bridge(num_steps):
 
 
 def test_law_of_an_endpoint():
-    """Periodic drift and noise over a long time: evidence, and the law of X_T given the datum, of the Euler chain."""
+    """Periodic drift and noise over a long time: evidence, and the law of X_T given the datum, of
+    the Euler chain.
+    """
     t1, num_steps, x0, v, variance = 12.57, 1257, -np.pi / 2, 1.0, 0.1
     ts, grid = np.linspace(0, t1, num_steps + 1), np.arange(-30, 30, 0.075)
     dt, sd = ts[1], np.sqrt(ts[1]) * (2 + 0.5 * np.cos(grid))
@@ -439,14 +484,17 @@ def test_law_of_an_endpoint():
     for k, t in enumerate(ts[:-1]):
         mean = grid + dt * (-0.1 * grid + 0.5 * np.sin(grid) + 0.5 * np.sin(t / 4))
         if k == 0:
-            p = 0.075 * scipy.stats.norm.pdf(grid, x0 + dt * (-0.1 * x0 + 0.5 * np.sin(x0)), sd0(x0, dt))
+            p = 0.075 * scipy.stats.norm.pdf(
+                grid, x0 + dt * (-0.1 * x0 + 0.5 * np.sin(x0)), sd0(x0, dt)
+            )
         else:
             p = forward(p, chain(mean, sd, grid))
     posterior = p * scipy.stats.norm.pdf(v, grid, np.sqrt(variance))
     truth = np.log(posterior.sum())
 
     sde = nb.SDE(
-        lambda t, x, args: -0.1 * x + 0.5 * jnp.sin(x) + 0.5 * jnp.sin(t / 4), lambda t, x, args: 2 + 0.5 * jnp.cos(x)
+        lambda t, x, args: -0.1 * x + 0.5 * jnp.sin(x) + 0.5 * jnp.sin(t / 4),
+        lambda t, x, args: 2 + 0.5 * jnp.cos(x),
     )
     guide = nb.FrozenGuide(nb.LinearSDE(-0.1, 2.0))
     bridge = nb.GuidedBridge(sde, nb.InexactMatch(variance).at([v]), x0=[x0], ts=ts, guide=guide)

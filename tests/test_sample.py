@@ -22,7 +22,8 @@ pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
 
 N, STEPS = 5, 3
 RATE, SIGMA, SPREAD = 0.8, 0.6, 0.05
-GUIDE = nb.FrozenGuide(nb.BrownianMotion(0.5))  # not the process's own: the weight depends on the noise
+# not the process's own: the weight depends on the noise
+GUIDE = nb.FrozenGuide(nb.BrownianMotion(0.5))
 SEEN = nb.InexactMatch(SPREAD)
 SDE = nb.LinearSDE(-RATE, SIGMA)
 DATA = np.random.default_rng(0).normal(0.5, 0.5, (N, 2))
@@ -31,7 +32,9 @@ NOISE = np.random.default_rng(1).standard_normal((N, STEPS, 2, 1))
 
 def law(mean, **kwargs):
     sde = nb.LinearSDE(-RATE, SIGMA, RATE * mean)
-    return nb.DiffusionEndpoint(sde, np.zeros(2), SEEN, t1=1.0, num_steps=STEPS, guide=GUIDE, **kwargs)
+    return nb.DiffusionEndpoint(
+        sde, np.zeros(2), SEEN, t1=1.0, num_steps=STEPS, guide=GUIDE, **kwargs
+    )
 
 
 def model(data=None, n=N):
@@ -66,7 +69,9 @@ def weights():
 
     def log_weight(v, z):
         sde = nb.LinearSDE(-RATE, SIGMA, RATE * 0.3)
-        bridge = nb.GuidedBridge(sde, SEEN.at(v), x0=np.zeros(2), t1=1.0, num_steps=STEPS, guide=GUIDE)
+        bridge = nb.GuidedBridge(
+            sde, SEEN.at(v), x0=np.zeros(2), t1=1.0, num_steps=STEPS, guide=GUIDE
+        )
         return bridge.log_weight(z)
 
     return np.array([log_weight(v, z) for v, z in zip(DATA, NOISE, strict=True)])
@@ -84,8 +89,13 @@ def test_density_is_prior_times_noise_times_weight(model, weights):
     prior, noise = priors()
     found, trace = log_density(model, (DATA,), {}, PARAMS)
     assert float(found) == pytest.approx(float(prior + noise.sum() + weights.sum()), abs=1e-10)
-    assert trace["wing_noise"]["infer"] == {"driving_noise": True} and not trace["wing_noise"]["is_observed"]
-    assert trace["wing"]["is_observed"] and [f.name for f in trace["wing"]["cond_indep_stack"]] == ["specimens"]
+    assert (
+        trace["wing_noise"]["infer"] == {"driving_noise": True}
+        and not trace["wing_noise"]["is_observed"]
+    )
+    assert trace["wing"]["is_observed"] and [f.name for f in trace["wing"]["cond_indep_stack"]] == [
+        "specimens"
+    ]
 
 
 def test_a_plate_is_a_loop(weights):
@@ -110,7 +120,9 @@ def test_nested_plates():
 
 
 @pytest.mark.parametrize("base", [model, plain], ids=["sample", "NoiseReparam"])
-@pytest.mark.parametrize("outside", [True, False], ids=["mask around the plate", "mask in the plate"])
+@pytest.mark.parametrize(
+    "outside", [True, False], ids=["mask around the plate", "mask in the plate"]
+)
 def test_mask_leaves_the_noise_its_prior(base, outside, weights):
     """Not masked, the noise of a masked datum keeps a proper posterior: its prior."""
     keep = np.array([True, False, True, True, False])
@@ -120,11 +132,15 @@ def test_mask_leaves_the_noise_its_prior(base, outside, weights):
             (nb.sample if base is model else numpyro.sample)("wing", law(0.3), obs=data)
 
     masked = handlers.mask(base, mask=keep) if outside else inside
-    masked = masked if base is model else handlers.reparam(masked, config={"wing": nb.NoiseReparam()})
+    masked = (
+        masked if base is model else handlers.reparam(masked, config={"wing": nb.NoiseReparam()})
+    )
     data = np.where(keep[:, None], DATA, np.nan)
     prior, noise = priors()
     trace = handlers.trace(handlers.substitute(masked, PARAMS)).get_trace(data)
-    np.testing.assert_allclose(trace["wing"]["fn"].log_prob(data), np.where(keep, weights, 0), atol=1e-10)
+    np.testing.assert_allclose(
+        trace["wing"]["fn"].log_prob(data), np.where(keep, weights, 0), atol=1e-10
+    )
     np.testing.assert_allclose(trace["wing_noise"]["fn"].log_prob(NOISE), noise, rtol=1e-12)
     gradient = jax.grad(lambda m: log_density(masked, (data,), {}, PARAMS | {"mean": m})[0])(0.3)
     assert np.isfinite(gradient)
@@ -151,12 +167,18 @@ def test_condition_do_substitute_and_block():
     trace = trace_of(handlers.condition(model, {"wing": DATA}))
     assert trace["wing"]["is_observed"] and np.array_equal(trace["wing"]["value"], DATA)
     found, _ = log_density(handlers.condition(model, {"wing": DATA}), (), {}, PARAMS)
-    assert float(found) == pytest.approx(float(log_density(model, (DATA,), {}, PARAMS)[0]), abs=1e-10)
+    assert float(found) == pytest.approx(
+        float(log_density(model, (DATA,), {}, PARAMS)[0]), abs=1e-10
+    )
     fixed = {"mean": 100.0, "wing_noise": NOISE}
     trace = trace_of(handlers.substitute(model, fixed))
     assert np.array_equal(trace["wing"]["fn"].noise, NOISE) and np.all(trace["wing"]["value"] > 20)
     assert np.all(trace_of(handlers.do(model, {"mean": 100.0}))["wing"]["value"] > 20)
-    assert set(trace_of(handlers.block(model, hide=["wing_noise"]), DATA)) == {"mean", "specimens", "wing"}
+    assert set(trace_of(handlers.block(model, hide=["wing_noise"]), DATA)) == {
+        "mean",
+        "specimens",
+        "wing",
+    }
 
 
 def lifted(data):
@@ -190,13 +212,24 @@ def test_own_parameters_of_each_specimen():
             mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
             sde = jax.vmap(lambda m: nb.LinearSDE(-RATE, SIGMA, RATE * m))(mean)
             one = nb.DiffusionEndpoint(
-                sde, np.zeros(2), SEEN, t1=1.0, num_steps=STEPS, guide=GUIDE, batch_shape=(N,), batched=("sde",)
+                sde,
+                np.zeros(2),
+                SEEN,
+                t1=1.0,
+                num_steps=STEPS,
+                guide=GUIDE,
+                batch_shape=(N,),
+                batched=("sde",),
             )
             nb.sample("wing", one, obs=data)
 
     means = np.linspace(-1, 1, N)
-    trace = handlers.trace(handlers.substitute(per_specimen, {"mean": means, "wing_noise": NOISE})).get_trace(DATA)
-    expected = np.array([law(m).given(z).log_prob(v) for m, z, v in zip(means, NOISE, DATA, strict=True)])
+    trace = handlers.trace(
+        handlers.substitute(per_specimen, {"mean": means, "wing_noise": NOISE})
+    ).get_trace(DATA)
+    expected = np.array(
+        [law(m).given(z).log_prob(v) for m, z, v in zip(means, NOISE, DATA, strict=True)]
+    )
     np.testing.assert_allclose(trace["wing"]["fn"].log_prob(DATA), expected, atol=1e-10)
 
     @jax.jit
@@ -236,9 +269,15 @@ def test_classes_are_summed_over():
     expected = np.logaddexp(np.log(0.3) + first, np.log(0.7) + second)
     np.testing.assert_allclose(trace["wing"]["fn"].log_prob(DATA), expected, atol=1e-8)
     prior = dist.Beta(2.0, 2.0).log_prob(0.3)
-    assert float(found) == pytest.approx(float(prior + priors()[1].sum() + expected.sum()), abs=1e-6)
-    rest, weights = split(classes, (DATA,), {}, {"share": jnp.log(0.3 / 0.7), "wing_noise": jnp.asarray(NOISE)})
-    assert weights == {} and float(rest) == pytest.approx(-float(prior + expected.sum() + np.log(0.21)), abs=1e-6)
+    assert float(found) == pytest.approx(
+        float(prior + priors()[1].sum() + expected.sum()), abs=1e-6
+    )
+    rest, weights = split(
+        classes, (DATA,), {}, {"share": jnp.log(0.3 / 0.7), "wing_noise": jnp.asarray(NOISE)}
+    )
+    assert weights == {} and float(rest) == pytest.approx(
+        -float(prior + expected.sum() + np.log(0.21)), abs=1e-6
+    )
 
 
 def chain(ys):
@@ -259,7 +298,14 @@ def test_a_scan_is_its_unrolled_loop():
     def unrolled(mean, noise):
         sde = nb.LinearSDE(-RATE, SIGMA, RATE * mean)
         laws = nb.DiffusionEndpoint(
-            sde, starts, SEEN, t1=1.0, num_steps=STEPS, guide=GUIDE, batch_shape=(N,), batched=("x0",)
+            sde,
+            starts,
+            SEEN,
+            t1=1.0,
+            num_steps=STEPS,
+            guide=GUIDE,
+            batch_shape=(N,),
+            batched=("x0",),
         )
         return laws.given(noise).log_prob(DATA)
 
@@ -267,12 +313,16 @@ def test_a_scan_is_its_unrolled_loop():
     prior, noise = priors()
     expected = unrolled(0.3, NOISE)
     found, trace = log_density(chain, (jnp.asarray(DATA),), {}, params)
-    np.testing.assert_allclose(trace["wing"]["fn"].log_prob(trace["wing"]["value"]), expected, atol=1e-6)
+    np.testing.assert_allclose(
+        trace["wing"]["fn"].log_prob(trace["wing"]["value"]), expected, atol=1e-6
+    )
     assert float(found) == pytest.approx(float(prior + noise.sum() + expected.sum()), abs=1e-5)
     rest, weights = split(chain, (jnp.asarray(DATA),), {}, params)
     assert float(rest) == pytest.approx(-float(prior), abs=1e-10)
     assert float(weights["wing"]) == pytest.approx(float(expected.sum()), abs=1e-5)
-    assert driven_by(chain, (jnp.asarray(DATA),), {}, params, ["wing_noise"]) == {"wing_noise": "wing"}
+    assert driven_by(chain, (jnp.asarray(DATA),), {}, params, ["wing_noise"]) == {
+        "wing_noise": "wing"
+    }
 
 
 # What is refused
@@ -304,25 +354,43 @@ HIDDEN = {
     "x0, columns": ("x0", lambda own: law_of(x0=np.zeros((2, 3)) + own)),
     "drift": ("sde", lambda own: law_of(nb.LinearSDE(-own, SIGMA), np.zeros(3))),
     "drift, matrix": ("sde", lambda own: law_of(nb.LinearSDE(-jnp.diag(own), SIGMA), np.zeros(3))),
-    "shift, columns": ("sde", lambda own: law_of(nb.LinearSDE(-1.0, SIGMA, np.zeros((2, 3)) + own), np.zeros((2, 3)))),
-    "args": ("sde", lambda own: law_of(nb.SDE(drift, lambda t, x, p: 0.5, jnp.stack([own, own])), np.zeros(3))),
+    "shift, columns": (
+        "sde",
+        lambda own: law_of(nb.LinearSDE(-1.0, SIGMA, np.zeros((2, 3)) + own), np.zeros((2, 3))),
+    ),
+    "args": (
+        "sde",
+        lambda own: law_of(nb.SDE(drift, lambda t, x, p: 0.5, jnp.stack([own, own])), np.zeros(3)),
+    ),
     "weights": (
         "sde",
-        lambda own: law_of(nb.LinearSDE(-1.0, SIGMA, space=nb.Landmarks(3, 2, weights=own)), TRIANGLE),
+        lambda own: law_of(
+            nb.LinearSDE(-1.0, SIGMA, space=nb.Landmarks(3, 2, weights=own)), TRIANGLE
+        ),
     ),
     "weights of the match": (
         "match",
-        lambda own: law_of(match=nb.InexactMatch(SPREAD, np.eye(4)[:3], space=nb.Landmarks(3, 1, own)), x0=np.zeros(4)),
+        lambda own: law_of(
+            match=nb.InexactMatch(SPREAD, np.eye(4)[:3], space=nb.Landmarks(3, 1, own)),
+            x0=np.zeros(4),
+        ),
     ),
     "corner of a grid": (
         "sde",
         lambda own: law_of(
-            nb.KunitaFlow(nb.Landmarks(2, 3), nb.GaussianKernel(1.0, 1.0), noise=nb.GridNoise(-own - 2, 3.0, 2)),
+            nb.KunitaFlow(
+                nb.Landmarks(2, 3),
+                nb.GaussianKernel(1.0, 1.0),
+                noise=nb.GridNoise(-own - 2, 3.0, 2),
+            ),
             np.eye(3)[:2],
         ),
     ),
     "variance": ("match", lambda own: law_of(match=nb.InexactMatch(own), x0=np.zeros(3))),
-    "operator": ("match", lambda own: law_of(match=nb.InexactMatch(SPREAD, own[None]), x0=np.zeros(3))),
+    "operator": (
+        "match",
+        lambda own: law_of(match=nb.InexactMatch(SPREAD, own[None]), x0=np.zeros(3)),
+    ),
     "cuts": ("match", lambda own: law_of(match=nb.IntervalCensored(jnp.cumsum(own)))),
     "guide": (
         "guide",
@@ -333,7 +401,9 @@ HIDDEN = {
     "t0": ("t0", lambda own: law_of(t0=-own)),
     "amplitude": (
         "amplitude",
-        lambda own: law_of(nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(own, 1.0)), TRIANGLE),
+        lambda own: law_of(
+            nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(own, 1.0)), TRIANGLE
+        ),
     ),
 }
 
@@ -357,15 +427,24 @@ def test_axes_that_hide_nothing():
 
     for x0 in (np.zeros(3), np.zeros((3, 2)), np.zeros((2, 3))):
         assert trace_of(shared, x0)["wing"]["value"].shape == (3, *x0.shape)
-    assert trace_of(shared, np.zeros(2), ts=np.array([0.0, 0.5, 1.0]))["wing"]["value"].shape == (3, 2)
+    assert trace_of(shared, np.zeros(2), ts=np.array([0.0, 0.5, 1.0]))["wing"]["value"].shape == (
+        3,
+        2,
+    )
     declared = {
         "nothing": lambda own: law_of(x0=np.zeros(3), batched=()),
         "grid of its own": lambda own: law_of(num_steps=2),
         "vmap": lambda own: law_of(
-            jax.vmap(lambda a: nb.LinearSDE(-a, SIGMA))(own), np.zeros(3), batch_shape=(3,), batched=("sde",)
+            jax.vmap(lambda a: nb.LinearSDE(-a, SIGMA))(own),
+            np.zeros(3),
+            batch_shape=(3,),
+            batched=("sde",),
         ),
         "guide of an SDE of its own": lambda own: law_of(
-            jax.vmap(lambda a: nb.LinearSDE(-a, SIGMA))(own), np.zeros(4), batch_shape=(3,), guide=GUIDE
+            jax.vmap(lambda a: nb.LinearSDE(-a, SIGMA))(own),
+            np.zeros(4),
+            batch_shape=(3,),
+            guide=GUIDE,
         ),
     }
     for build in declared.values():
@@ -375,7 +454,9 @@ def test_axes_that_hide_nothing():
 
 
 def test_noise_that_was_dropped():
-    message = "`wing_noise` has no value.*do not hold the noise that drives `wing`.*no `~z.wing_noise`"
+    message = (
+        "`wing_noise` has no value.*do not hold the noise that drives `wing`.*no `~z.wing_noise`"
+    )
     with pytest.raises(ValueError, match=message):
         log_likelihood(model, {"mean": jnp.zeros(4)}, DATA)
     with pytest.raises(ValueError, match=message):
@@ -392,7 +473,9 @@ def test_noise_of_other_data(number):
 
 def test_an_enumerated_class():
     """funsor, which enumerates, may not be installed: its handler is known by its name."""
-    enumeration = type("enum", (Messenger,), {"__module__": "numpyro.contrib.funsor.enum_messenger"})
+    enumeration = type(
+        "enum", (Messenger,), {"__module__": "numpyro.contrib.funsor.enum_messenger"}
+    )
 
     def enumerated():
         means = jnp.array([0.0, 1.0])[:, None]  # of two classes, in front of the plate
@@ -404,7 +487,10 @@ def test_an_enumerated_class():
         with numpyro.plate("specimens", N):
             nb.sample("wing", law(0.3), obs=DATA)
 
-    with enumeration(), pytest.raises(ValueError, match="site `wing`.*enumerated.*MixtureGeneral.*given"):
+    with (
+        enumeration(),
+        pytest.raises(ValueError, match="site `wing`.*enumerated.*MixtureGeneral.*given"),
+    ):
         trace_of(enumerated)
     with enumeration():
         assert trace_of(other)["wing"]["value"].shape == (N, 2)
@@ -417,7 +503,9 @@ def test_data_of_no_kind():
 
 
 def test_errors_name_the_site():
-    with pytest.raises(ValueError, match=r"site `wing`: `obs` must have shape \(5, 2\).*got \(4, 2\)"):
+    with pytest.raises(
+        ValueError, match=r"site `wing`: `obs` must have shape \(5, 2\).*got \(4, 2\)"
+    ):
         trace_of(model, DATA[:4])
     with pytest.raises(ValueError, match=r"`obs` must have shape \(5, 2\).*got \(2,\).*plate"):
         trace_of(reparametrised, DATA[0])
@@ -448,7 +536,9 @@ def test_a_parameter_inside_the_plate():
         def model(data=None):
             with numpyro.plate("specimens", 2):
                 rate = numpyro.sample("rate", dist.LogNormal())
-                one = nb.DiffusionEndpoint(rate_of_sde(rate), np.zeros(2), SEEN, t1=1.0, num_steps=STEPS)
+                one = nb.DiffusionEndpoint(
+                    rate_of_sde(rate), np.zeros(2), SEEN, t1=1.0, num_steps=STEPS
+                )
                 return nb.sample("wing", one, obs=data)
 
         return model
@@ -462,7 +552,8 @@ def test_a_parameter_inside_the_plate():
             trace_of(hidden(sde))
     flow = handlers.seed(
         lambda: nb.KunitaFlow(
-            nb.Landmarks(4, 2), nb.GaussianKernel(numpyro.sample("a", dist.LogNormal().expand([2])), 1.0)
+            nb.Landmarks(4, 2),
+            nb.GaussianKernel(numpyro.sample("a", dist.LogNormal().expand([2])), 1.0),
         ),
         0,
     )
@@ -501,7 +592,9 @@ def test_nuts_has_the_closed_form_posterior(mcmc):
     mean, sd = posterior_of_mean()
     ess = effective_sample_size(draws[None])
     ess_square = effective_sample_size((draws[None] - mean) ** 2)
-    assert min(ess, ess_square) > 200, "standard errors of 0.07 and 0.05 SDs: a posterior 30 % too wide is seen"
+    assert min(ess, ess_square) > 200, (
+        "standard errors of 0.07 and 0.05 SDs: a posterior 30 % too wide is seen"
+    )
     assert abs(draws.mean() - mean) < 4 * sd / np.sqrt(ess)
     assert abs(draws.std() / sd - 1) < 4 / np.sqrt(2 * ess_square)
     assert not np.any(mcmc.get_extra_fields()["diverging"])
@@ -524,7 +617,12 @@ def test_predictive(mcmc):
 @pytest.mark.slow
 def test_an_unobserved_site_may_be_sampled_by_nuts():
     """N(z) exp(log_prob(v | z)) is a joint density of (z, v), whose margin of v is the law."""
-    mcmc = MCMC(NUTS(lambda: nb.sample("wing", law(0.5))), num_warmup=200, num_samples=1000, progress_bar=False)
+    mcmc = MCMC(
+        NUTS(lambda: nb.sample("wing", law(0.5))),
+        num_warmup=200,
+        num_samples=1000,
+        progress_bar=False,
+    )
     mcmc.run(jr.key(0))
     v = np.asarray(mcmc.get_samples()["wing"])
     sd = np.sqrt(SIGMA**2 * (1 - np.exp(-2 * RATE)) / (2 * RATE) + SPREAD)
@@ -554,7 +652,9 @@ def test_a_point_estimate_has_the_density_of_the_model():
 
 @pytest.mark.slow
 def test_kunita_flow_out_of_the_box():
-    """In single precision, from NumPyro's own start: uniform on (−2, 2) for the noise is no trouble."""
+    """In single precision, from NumPyro's own start: uniform on (−2, 2) for the noise is no
+    trouble.
+    """
     with jax.enable_x64(False):
         angles = np.linspace(0, 2 * np.pi, 4, endpoint=False).astype(np.float32)
         circle = np.stack([np.cos(angles), np.sin(angles)], 1)
@@ -570,5 +670,9 @@ def test_kunita_flow_out_of_the_box():
         mcmc = MCMC(NUTS(flow_model), num_warmup=80, num_samples=80, progress_bar=False)
         mcmc.run(jr.key(0), data, extra_fields=("accept_prob",))
         draws, fields = np.asarray(mcmc.get_samples()["amplitude"]), mcmc.get_extra_fields()
-        assert draws.dtype == np.float32 and fields["diverging"].sum() == 0 and fields["accept_prob"].mean() > 0.7
+        assert (
+            draws.dtype == np.float32
+            and fields["diverging"].sum() == 0
+            and fields["accept_prob"].mean() > 0.7
+        )
         assert abs(np.log(draws / 0.3).mean()) < 4 * np.log(draws).std()

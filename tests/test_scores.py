@@ -1,7 +1,8 @@
-"""Learned scores: the targets of the regressions, the gradient of the bound, what training does and does not change.
+"""Learned scores: the targets of the regressions, the gradient of the bound, what training does and
+does not change.
 
-Referees: closed forms of linear SDEs and of geometric Brownian motion, quadrature for nonlinear scalar models, plain
-differences, and identities that hold for any density.
+Referees: closed forms of linear SDEs and of geometric Brownian motion, quadrature for nonlinear
+scalar models, plain differences, and identities that hold for any density.
 """
 
 import functools
@@ -24,7 +25,13 @@ from helpers import exact_affine, killed_and_ended
 import numpyro_bridges as nb
 from numpyro_bridges.guiding._score import Standard
 from numpyro_bridges.scores import ScoreGuide, _training as training_module
-from numpyro_bridges.scores._clouds import adjoint_cloud, ends, forward_cloud, reversal_cloud, reversed_bridge
+from numpyro_bridges.scores._clouds import (
+    adjoint_cloud,
+    ends,
+    forward_cloud,
+    reversal_cloud,
+    reversed_bridge,
+)
 from numpyro_bridges.scores._fit import Problem, _gain, adjoint, residual
 from numpyro_bridges.scores._reversed import ReversedSDE
 from numpyro_bridges.scores._training import train
@@ -52,14 +59,20 @@ def linear(B, sigma, beta, x0, v, variance):
 
     def score(t, x):
         phi, shift, C = law(1 - t)
-        return np.linalg.solve(C + variance * np.eye(len(v)), (v - x @ phi.T - shift[:, 0]).T).T @ phi
+        return (
+            np.linalg.solve(C + variance * np.eye(len(v)), (v - x @ phi.T - shift[:, 0]).T).T @ phi
+        )
 
     def score_forward(t, x):
         phi, shift, C = law(t)
         return -np.linalg.solve(C, (x - phi @ x0 - shift[:, 0]).T).T
 
     match = nb.InexactMatch(variance) if variance else nb.ExactMatch()
-    return nb.GuidedBridge(nb.LinearSDE(B, sigma, beta), match.at(v), x0=x0, ts=TS), score, score_forward
+    return (
+        nb.GuidedBridge(nb.LinearSDE(B, sigma, beta), match.at(v), x0=x0, ts=TS),
+        score,
+        score_forward,
+    )
 
 
 RATE, NOISE, FROM, TO = 0.3, 0.4, 1.0, 1.5
@@ -70,7 +83,11 @@ def geometric():
     m = RATE - NOISE**2 / 2
     sde = nb.SDE(lambda t, x, args: RATE * x, lambda t, x, args: NOISE * x)
     bridge = nb.GuidedBridge(sde, nb.ExactMatch().at([TO]), x0=[FROM], ts=TS)
-    return bridge, lambda t, x: (np.log(TO / x) - m * (1 - t)) / (NOISE**2 * (1 - t) * x), geometric_forward
+    return (
+        bridge,
+        lambda t, x: (np.log(TO / x) - m * (1 - t)) / (NOISE**2 * (1 - t) * x),
+        geometric_forward,
+    )
 
 
 def geometric_forward(t, x, xp=np):
@@ -86,7 +103,12 @@ def plain_standard(shape=(), context=0, duration=1.0):
 MODELS = {
     "ou": lambda: linear([-0.3], [0.7], [0.4], [0.2], [0.9], 0.0),
     "vector": lambda: linear(
-        [[-0.2, 0.2], [-0.1, -0.3]], [[0.6, 0.2], [0.0, 0.5]], [0.3, -0.1], [0.4, -0.3], [0.7, -0.2], 0.1
+        [[-0.2, 0.2], [-0.1, -0.3]],
+        [[0.6, 0.2], [0.0, 0.5]],
+        [0.3, -0.1],
+        [0.4, -0.3],
+        [0.7, -0.2],
+        0.1,
     ),
     "geometric": geometric,
 }
@@ -113,7 +135,8 @@ def mean_and_error(values):
      ("geometric", "forward")],
 )  # fmt: skip
 def test_targets_are_scores_on_average(model, method):
-    """E (g − s) φ(x) = 0 for s the closed form and φ = 1, x: within 3 SE, and 2 % for the steps' length, at any ρ.
+    """E (g − s) φ(x) = 0 for s the closed form and φ = 1, x: within 3 SE, and 2 % for the steps'
+    length, at any ρ.
 
     In units in which φ = x gives 1 for an error of the whole of s.
     """
@@ -129,22 +152,34 @@ def test_targets_are_scores_on_average(model, method):
         x, g, w = (np.asarray(a) for a in (cloud.x, cloud.score, cloud.weights[..., None]))
         np.testing.assert_allclose(np.sum(w, 2), 1.0, rtol=1e-10)
         flat = np.moveaxis(x, 1, 0).reshape(K, -1, x.shape[-1])
-        s = np.stack([truth(t, y).reshape(x[:, 0].shape) for t, y in zip(np.asarray(times), flat, strict=True)], 1)
+        s = np.stack(
+            [
+                truth(t, y).reshape(x[:, 0].shape)
+                for t, y in zip(np.asarray(times), flat, strict=True)
+            ],
+            1,
+        )
         mean = np.mean(np.sum(w * x, 2, keepdims=True), 0, keepdims=True)
         sd = np.sqrt(np.mean(np.sum(w * (x - mean) ** 2, 2, keepdims=True), 0, keepdims=True))
         gap = (g - s) * sd
-        gaps = np.concatenate([np.mean(np.sum(w * gap * phi, 2), 1) for phi in (1.0, (x - mean) / sd)], 1)
+        gaps = np.concatenate(
+            [np.mean(np.sum(w * gap * phi, 2), 1) for phi in (1.0, (x - mean) / sd)], 1
+        )
         gap, error = mean_and_error(gaps)
         print(gap, error)
         assert np.all(error < 0.015)
         assert np.all(np.abs(gap) < 3 * error + 0.02)
 
 
-@pytest.mark.parametrize("guide", [nb.Unguided(), nb.FrozenGuide(nb.BrownianMotion(1.5))], ids=["unguided", "wrong"])
+@pytest.mark.parametrize(
+    "guide", [nb.Unguided(), nb.FrozenGuide(nb.BrownianMotion(1.5))], ids=["unguided", "wrong"]
+)
 def test_end_states_are_those_of_the_conditioned_process(guide):
     """A normal posterior, whatever the guide: prior N(0, 0.5), observed with variance 0.1."""
     match = nb.InexactMatch(0.1).at([1.0])
-    bridge = nb.GuidedBridge(nb.BrownianMotion(0.5), match, x0=[0.0], t1=1.0, num_steps=3, guide=guide)
+    bridge = nb.GuidedBridge(
+        nb.BrownianMotion(0.5), match, x0=[0.0], t1=1.0, num_steps=3, guide=guide
+    )
     found = np.asarray(jax.jit(lambda key: ends(bridge, key, 20000))(jr.key(0)))[:, 0]
     variance = 0.5 * 0.1 / 0.6
     error = np.sqrt(variance / 5000)  # an ESS of at least a quarter
@@ -153,7 +188,9 @@ def test_end_states_are_those_of_the_conditioned_process(guide):
 
 
 def test_rho_takes_the_noise_from_the_targets():
-    """Brownian motion to an exact end: g = −(x − v)/(1 − t) without noise at ρ_j = j/(j + 1), unlike at ρ = 0."""
+    """Brownian motion to an exact end: g = −(x − v)/(1 − t) without noise at ρ_j = j/(j + 1),
+    unlike at ρ = 0.
+    """
     bridge, score, _ = linear([0.0], [1.0], [0.0], [0.2], [0.9], 0.0)
 
     def noise(rho):
@@ -169,7 +206,9 @@ def test_rho_takes_the_noise_from_the_targets():
 # A weighted cloud with a rate c that varies.
 
 SINE = nb.SDE(lambda t, x, args: 2 - 2 * jnp.sin(8 * x), lambda t, x, args: 0.5)
-TANH = nb.SDE(lambda t, x, args: jnp.sin(2 * x) - 0.5 * x, lambda t, x, args: 0.5 + 0.2 * jnp.tanh(x))
+TANH = nb.SDE(
+    lambda t, x, args: jnp.sin(2 * x) - 0.5 * x, lambda t, x, args: 0.5 + 0.2 * jnp.tanh(x)
+)
 SCALARS = {
     "sine": (SINE, lambda x: 2 - 2 * np.sin(8 * x), lambda x: 0.5 + 0 * x, np.pi / 2, 1.0),
     "tanh": (TANH, lambda x: np.sin(2 * x) - 0.5 * x, lambda x: 0.5 + 0.2 * np.tanh(x), 0.9, 1.0),
@@ -181,7 +220,9 @@ def backward_density(drift, diffusion, v, left, steps=512):
     grid, dt = np.linspace(-2.5, 4.0, 900), left / steps
 
     def step(y):
-        return scipy.stats.norm.pdf(y, (grid + dt * drift(grid))[:, None], np.sqrt(dt) * diffusion(grid)[:, None])
+        return scipy.stats.norm.pdf(
+            y, (grid + dt * drift(grid))[:, None], np.sqrt(dt) * diffusion(grid)[:, None]
+        )
 
     last = step(np.array([v]))[:, 0]
     power, P = None, step(grid[None]) * (grid[1] - grid[0])
@@ -194,24 +235,36 @@ def backward_density(drift, diffusion, v, left, steps=512):
 
 @pytest.mark.parametrize("name", list(SCALARS))
 def test_the_weighted_adjoint_process_is_h(name):
-    """E φ over the cloud against ∫ h φ / ∫ h by quadrature; E g φ = −E φ', which makes g the score of the cloud."""
+    """E φ over the cloud against ∫ h φ / ∫ h by quadrature; E g φ = −E φ', which makes g the score
+    of the cloud.
+    """
     sde, drift, diffusion, v, scale = SCALARS[name]
     ts = np.linspace(0, 1, 201)
     bridge = nb.GuidedBridge(sde, nb.ExactMatch().at([v]), x0=[0.0], ts=ts)
     rho = jax.jit(lambda key: adjoint_cloud(bridge, key, 1000).rho)(jr.key(1))
-    draw = jax.jit(lambda keys: jax.lax.map(lambda key: adjoint_cloud(bridge, key, 1000, rho), keys))
+    draw = jax.jit(
+        lambda keys: jax.lax.map(lambda key: adjoint_cloud(bridge, key, 1000, rho), keys)
+    )
     cloud = draw(jr.split(jr.key(0), 20))
-    ts, x, g, w = ts[:-1], *(np.asarray(a) for a in (cloud.x[..., 0], cloud.score[..., 0], cloud.weights))
+    ts, x, g, w = (
+        ts[:-1],
+        *(np.asarray(a) for a in (cloud.x[..., 0], cloud.score[..., 0], cloud.weights)),
+    )
     for k in (100, 150):
         grid, h = backward_density(drift, diffusion, v, 1 - ts[k])
-        for f, slope in ((lambda x: x, lambda x: 1.0), (lambda x: np.cos(8 * x), lambda x: -8 * np.sin(8 * x))):
+        for f, slope in (
+            (lambda x: x, lambda x: 1.0),
+            (lambda x: np.cos(8 * x), lambda x: -8 * np.sin(8 * x)),
+        ):
             truth = np.sum(h * f(grid)) / np.sum(h)
             sd = np.sqrt(np.sum(h * (f(grid) - truth) ** 2) / np.sum(h))
             found, error = mean_and_error(np.sum(w[:, k] * f(x[:, k]), 1) / sd)
             print(name, k, found - truth / sd, error)
             assert error < 0.02 and abs(found - truth / sd) < 3 * error + 0.01
             size = np.sqrt(np.sum(h * slope(grid) ** 2) / np.sum(h))
-            found, error = mean_and_error(np.sum(w[:, k] * (g[:, k] * (f(x[:, k]) - truth) + slope(x[:, k])), 1) / size)
+            found, error = mean_and_error(
+                np.sum(w[:, k] * (g[:, k] * (f(x[:, k]) - truth) + slope(x[:, k])), 1) / size
+            )
             print(name, k, "score", found, error)
             assert error < 0.08 and abs(found) < 3 * error
 
@@ -230,14 +283,21 @@ def test_rate_and_drift_of_the_reversed_process(key):
     t = clock - 0.4
     # a_ij = (2 + t)² A_ij s_i s_j
     scale = (2 + t) ** 2
-    first = [scale * (sum(A[i, j] * s[i] * c[j] for j in range(2)) + A[i, i] * c[i] * s[i]) for i in range(2)]
+    first = [
+        scale * (sum(A[i, j] * s[i] * c[j] for j in range(2)) + A[i, i] * c[i] * s[i])
+        for i in range(2)
+    ]
     second = sum(
         scale * A[i, j] * (c[i] * c[j] if i != j else 2 * c[i] ** 2 - 2 * np.sin(y[i]) * s[i])
         for i in range(2)
         for j in range(2)
     )
-    np.testing.assert_allclose(reverse.drift(0.4, x), np.array(first) - B @ y - t * np.sin(y), rtol=1e-10)
-    np.testing.assert_allclose(reverse.rate(0.4, x), 0.5 * second - np.trace(B) - t * np.sum(c), rtol=1e-10)
+    np.testing.assert_allclose(
+        reverse.drift(0.4, x), np.array(first) - B @ y - t * np.sin(y), rtol=1e-10
+    )
+    np.testing.assert_allclose(
+        reverse.rate(0.4, x), 0.5 * second - np.trace(B) - t * np.sum(c), rtol=1e-10
+    )
 
 
 def test_divergence_of_a_kunita_flow(key):
@@ -249,13 +309,17 @@ def test_divergence_of_a_kunita_flow(key):
     K = alpha**2 * np.pi * ell**2 * np.exp(-np.sum(d**2, -1) / (4 * ell**2))
     found = flow.covariance_divergence(0.0, jnp.asarray(x))
     np.testing.assert_allclose(found, np.sum(K[..., None] * d, 1) / (2 * ell**2), rtol=1e-10)
-    np.testing.assert_allclose(found, AbstractSDE.covariance_divergence(flow, 0.0, jnp.asarray(x)), rtol=1e-10)
+    np.testing.assert_allclose(
+        found, AbstractSDE.covariance_divergence(flow, 0.0, jnp.asarray(x)), rtol=1e-10
+    )
     again = flow.covariance_double_divergence(0.0, jnp.asarray(x))
     square = np.sum(d**2, -1)
     np.testing.assert_allclose(
         again, np.sum(K * (1 - np.eye(4)) * (2 - square / (2 * ell**2))) / (2 * ell**2), rtol=1e-10
     )
-    np.testing.assert_allclose(again, AbstractSDE.covariance_double_divergence(flow, 0.0, jnp.asarray(x)), rtol=1e-10)
+    np.testing.assert_allclose(
+        again, AbstractSDE.covariance_double_divergence(flow, 0.0, jnp.asarray(x)), rtol=1e-10
+    )
 
 
 # The gradient of the evidence bound.
@@ -276,7 +340,12 @@ def loss_of(method, bridge, network, batch_size):
     shape = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
     guide = ScoreGuide(bridge.guide, network, plain_standard(shape))
     training = nb.scores.Training(batch_size=batch_size)
-    method(Problem(lambda key: bridge, False, guide, training, lambda _, loss, *rest: found.append(loss)), jr.key(0))
+    method(
+        Problem(
+            lambda key: bridge, False, guide, training, lambda _, loss, *rest: found.append(loss)
+        ),
+        jr.key(0),
+    )
     return found[0]
 
 
@@ -292,17 +361,28 @@ def gradient_and_loss(loss, network):
 def test_an_exact_guide_has_no_gradient(key):
     """For every noise, with a network that is 0: training does not spoil it. A wrong guide has one."""
     network = nb.scores.MLP((2, 1), key=key, width=4, depth=1)
-    for sde, small in ((nb.BrownianMotion(np.array([0.5, 0.2])), True), (nb.LinearSDE(-0.5, 0.4, 0.3), False)):
+    for sde, small in (
+        (nb.BrownianMotion(np.array([0.5, 0.2])), True),
+        (nb.LinearSDE(-0.5, 0.4, 0.3), False),
+    ):
         guide = nb.FrozenGuide(nb.BrownianMotion(np.array([0.5, 0.2])))
-        bridge = nb.GuidedBridge(sde, nb.ExactMatch().at([0.3, 0.1]), x0=[0.0, 0.2], t1=1.0, num_steps=4, guide=guide)
+        bridge = nb.GuidedBridge(
+            sde, nb.ExactMatch().at([0.3, 0.1]), x0=[0.0, 0.2], t1=1.0, num_steps=4, guide=guide
+        )
         gradient, _, arrays = gradient_and_loss(loss_of(residual, bridge, network, 3), network)
-        largest = max(float(jnp.max(jnp.abs(g))) for g in jax.tree.leaves(jax.jit(gradient)(arrays, key)))
+        largest = max(
+            float(jnp.max(jnp.abs(g))) for g in jax.tree.leaves(jax.jit(gradient)(arrays, key))
+        )
         assert largest < 1e-12 if small else largest > 1e-3
 
 
 def test_a_learned_guide_can_be_corrected():
-    """Score matching asks for what guide and network together lack: here minus what was put on an exact guide."""
-    bridge = nb.GuidedBridge(nb.BrownianMotion(0.3), nb.ExactMatch().at([0.5]), x0=[0.0], t1=1.0, num_steps=6)
+    """Score matching asks for what guide and network together lack: here minus what was put on an
+    exact guide.
+    """
+    bridge = nb.GuidedBridge(
+        nb.BrownianMotion(0.3), nb.ExactMatch().at([0.5]), x0=[0.0], t1=1.0, num_steps=6
+    )
     added = Affine(jnp.array([0.7, -0.4]))
     spoilt = bridge.with_guide(ScoreGuide(bridge.guide, added, plain_standard((1, 1))))
     nothing, opposite = Affine(0 * added.p), Affine(-added.p)
@@ -315,10 +395,17 @@ def test_a_learned_guide_can_be_corrected():
 
 
 def test_the_gradient_of_the_bound_is_unbiased():
-    """Its mean is the difference quotient of E log w, for a wrong guide and a network that is not 0."""
+    """Its mean is the difference quotient of E log w, for a wrong guide and a network that is not
+    0.
+    """
     guide = nb.FrozenGuide(nb.BrownianMotion(0.3))
     bridge = nb.GuidedBridge(
-        nb.LinearSDE(-1.0, 0.7, 0.5), nb.ExactMatch().at([0.9]), x0=[0.2], t1=1.0, num_steps=6, guide=guide
+        nb.LinearSDE(-1.0, 0.7, 0.5),
+        nb.ExactMatch().at([0.9]),
+        x0=[0.2],
+        t1=1.0,
+        num_steps=6,
+        guide=guide,
     )
     network, h = Affine(jnp.array([0.3, -0.4])), 1e-4
     gradient, value, arrays = gradient_and_loss(loss_of(residual, bridge, network, 500), network)
@@ -338,7 +425,9 @@ OPTIMA = {"drift": (nb.LinearSDE(0.0, 1.0, 1.0), 0.5, 50), "ou-1": (nb.LinearSDE
           "ou-10": (nb.LinearSDE(-10.0, 1.0), -1.49787, 800)}  # fmt: skip
 
 
-@pytest.mark.parametrize("case", ["drift", *(pytest.param(c, marks=pytest.mark.slow) for c in OPTIMA if c != "drift")])
+@pytest.mark.parametrize(
+    "case", ["drift", *(pytest.param(c, marks=pytest.mark.slow) for c in OPTIMA if c != "drift")]
+)
 def test_the_bound_reaches_its_optimum(case):
     """−E log(w/h̃(0, x0)) within 1 % of log(h̃/h)(0, x0): a Brownian motion guides what it is not."""
     sde, optimum, num_steps = OPTIMA[case]
@@ -356,7 +445,9 @@ def test_the_bound_reaches_its_optimum(case):
         progress=False,
     )
     bridge = nb.GuidedBridge(sde, match, x0=[0.0], t1=1.0, num_steps=num_steps, guide=score)
-    log_weight = np.asarray(jax.jit(jax.vmap(bridge.log_weight))(jr.normal(jr.key(2), (4000, num_steps, 1, 1))))
+    log_weight = np.asarray(
+        jax.jit(jax.vmap(bridge.log_weight))(jr.normal(jr.key(2), (4000, num_steps, 1, 1)))
+    )
     found, error = mean_and_error(scipy.stats.norm.logpdf(0.0) - log_weight)
     assert error < 0.004 * abs(optimum)
     assert abs(found - optimum) < 0.01 * abs(optimum)
@@ -376,12 +467,16 @@ def judged(network):
 
 
 def trained(training=None, key=0, loss=quadratic, judge=judged, **kwargs):
-    training = nb.scores.Training(20, interval=5, learning_rate=0.1) if training is None else training
+    training = (
+        nb.scores.Training(20, interval=5, learning_rate=0.1) if training is None else training
+    )
     return train(jnp.zeros(2), loss, judge, jr.key(key), training, progress=False, **kwargs)
 
 
 def test_training_goes_on_where_it_was_killed(tmp_path, monkeypatch):
-    """The same network and history, bit by bit, as without the interruption; nothing is left to do a third time."""
+    """The same network and history, bit by bit, as without the interruption; nothing is left to do
+    a third time.
+    """
     whole, history = trained()
     saved, looks = training_module._save, []
 
@@ -407,9 +502,18 @@ def test_training_goes_on_where_it_was_killed(tmp_path, monkeypatch):
 
 
 def long_training(folder):
-    sde, condition = nb.SDE(lambda t, x, a: jnp.sin(x), lambda t, x, a: 0.5), nb.ExactMatch().at(jnp.ones(1))
+    sde, condition = (
+        nb.SDE(lambda t, x, a: jnp.sin(x), lambda t, x, a: 0.5),
+        nb.ExactMatch().at(jnp.ones(1)),
+    )
     training = nb.scores.Training(600, 4, interval=5, held_out=8, patience=None)
-    settings = {"x0": jnp.zeros(1), "t1": 1.0, "num_steps": 4, "training": training, "progress": False}
+    settings = {
+        "x0": jnp.zeros(1),
+        "t1": 1.0,
+        "num_steps": 4,
+        "training": training,
+        "progress": False,
+    }
     return nb.scores.fit(sde, condition, key=jr.key(0), directory=folder, **settings)
 
 
@@ -421,13 +525,19 @@ def test_training_survives_kills(num_kills, tmp_path):
     def written():
         return file.stat().st_mtime_ns if file.exists() else 0
 
-    killed_and_ended(__file__, file.parent, progress=written, num_kills=num_kills, within=0.3 / num_kills)
+    killed_and_ended(
+        __file__, file.parent, progress=written, num_kills=num_kills, within=0.3 / num_kills
+    )
     stamp = written()
     found, whole = long_training(file.parent), long_training(tmp_path / "whole")
     assert written() == stamp  # nothing was left to do
     for guide in (found, whole):
         guide.history.pop("seconds")
-    jax.tree.map(np.testing.assert_array_equal, eqx.filter(found, eqx.is_array), eqx.filter(whole, eqx.is_array))
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        eqx.filter(found, eqx.is_array),
+        eqx.filter(whole, eqx.is_array),
+    )
 
 
 def test_a_directory_belongs_to_one_training(tmp_path):
@@ -436,10 +546,14 @@ def test_a_directory_belongs_to_one_training(tmp_path):
     others = {
         "problem": dict(problem={"x0": jnp.ones(2)}),
         "key": dict(problem={"x0": jnp.zeros(2)}, key=1),
-        "training.interval": dict(problem={"x0": jnp.zeros(2)}, training=nb.scores.Training(20, interval=4)),
+        "training.interval": dict(
+            problem={"x0": jnp.zeros(2)}, training=nb.scores.Training(20, interval=4)
+        ),
     }
     for name, other in others.items():
-        with pytest.raises(ValueError, match=rf"`directory` holds .* differs in {name}\. .*another directory"):
+        with pytest.raises(
+            ValueError, match=rf"`directory` holds .* differs in {name}\. .*another directory"
+        ):
             trained(file=file, **other)
     file.write_bytes(b"something else")
     with pytest.raises(ValueError, match="`directory` holds the training of something else"):
@@ -447,7 +561,9 @@ def test_a_directory_belongs_to_one_training(tmp_path):
 
 
 def test_training_stops_at_a_loss_that_is_not_finite():
-    """With the last good network: updates of size 1 make the loss of this network infinite at w > 12."""
+    """With the last good network: updates of size 1 make the loss of this network infinite at w >
+    12.
+    """
 
     def loss(network, key):
         return jnp.sum(jnp.where(network > 12, jnp.nan, -network)), network
@@ -456,15 +572,21 @@ def test_training_stops_at_a_loss_that_is_not_finite():
         return jnp.sum(network), jnp.sum(network), jnp.ones(())
 
     for patience in (5, None):
-        training = nb.scores.Training(40, optimizer=optax.sgd(1.0), interval=5, average=0.0, patience=patience)
-        with pytest.warns(UserWarning, match="stopped: the loss was not finite at update 13. .*`learning_rate`"):
+        training = nb.scores.Training(
+            40, optimizer=optax.sgd(1.0), interval=5, average=0.0, patience=patience
+        )
+        with pytest.warns(
+            UserWarning, match="stopped: the loss was not finite at update 13. .*`learning_rate`"
+        ):
             network, history = trained(training, loss=loss, judge=judge)
         np.testing.assert_allclose(network, 10.0)
         np.testing.assert_allclose(history["update"], [0, 5, 10])
 
 
 def test_the_best_network_is_kept():
-    """Judged at each look, the one at the start included; training ends after `patience` looks without a better one."""
+    """Judged at each look, the one at the start included; training ends after `patience` looks
+    without a better one.
+    """
 
     def worse(network):
         return -jnp.sum(network**2), jnp.zeros(()), jnp.ones(())
@@ -481,17 +603,22 @@ def test_a_network_of_half_the_ess_is_not_kept():
 
     def judge(network):
         far = jnp.sum(network)
-        ess = jnp.where(far < 0.35, 1.0, jnp.where(far < 0.85, 0.45, jnp.where(far < 1.35, 0.55, jnp.nan)))
+        ess = jnp.where(
+            far < 0.35, 1.0, jnp.where(far < 0.85, 0.45, jnp.where(far < 1.35, 0.55, jnp.nan))
+        )
         return far, far, ess
 
     def loss(network, key):
         return -jnp.sum(network), network
 
     def run(most, patience=1):
-        training = nb.scores.Training(most, optimizer=optax.sgd(0.05), interval=1, average=0.0, patience=patience)
+        training = nb.scores.Training(
+            most, optimizer=optax.sgd(0.05), interval=1, average=0.0, patience=patience
+        )
         return trained(training, loss=loss, judge=judge)
 
-    for most, kept in ((3, 0.3), (8, 0.3), (9, 0.9), (13, 1.3), (20, 2.0)):  # what is not known is no objection
+    # what is not known is no objection
+    for most, kept in ((3, 0.3), (8, 0.3), (9, 0.9), (13, 1.3), (20, 2.0)):
         network, history = run(most)
         assert float(jnp.sum(network)) == pytest.approx(kept)
         assert history["update"][-1] == most
@@ -500,7 +627,9 @@ def test_a_network_of_half_the_ess_is_not_kept():
 
 def test_training_makes_no_more_updates_than_asked(tmp_path):
     """The last look is after fewer updates than the others, and a resumed training has the same."""
-    training = nb.scores.Training(12, interval=5, optimizer=optax.sgd(0.05), average=0.0, patience=None)
+    training = nb.scores.Training(
+        12, interval=5, optimizer=optax.sgd(0.05), average=0.0, patience=None
+    )
     counted = lambda network, key: (-jnp.sum(network), network)  # noqa: E731
     network, history = trained(training, loss=counted, file=tmp_path / "training.eqx")
     np.testing.assert_array_equal(history["update"], [0, 5, 10, 12])
@@ -525,11 +654,31 @@ def test_training_is_watched():
 SPREAD = 0.2 * np.sqrt(64) * scipy.stats.zscore(np.random.default_rng(0).normal(size=64), ddof=1)
 GAINS = {
     # value of the guide, its bounds, those of the network, what is said
-    "nothing-to-learn": (np.inf, 5.0, 5.0 + 0 * SPREAD, "brought nothing: the weights of the guide are equal"),
-    "kept": (5.0, 5.0, 5.0 + 0 * SPREAD, "brought nothing: no network was better than the guide alone"),
-    "within-its-error": (5.0, 5.0, 5.3 + SPREAD, "brought nothing: .* is 0.3 ± 0.2 nats above .*ESS 60 % .50 %."),
+    "nothing-to-learn": (
+        np.inf,
+        5.0,
+        5.0 + 0 * SPREAD,
+        "brought nothing: the weights of the guide are equal",
+    ),
+    "kept": (
+        5.0,
+        5.0,
+        5.0 + 0 * SPREAD,
+        "brought nothing: no network was better than the guide alone",
+    ),
+    "within-its-error": (
+        5.0,
+        5.0,
+        5.3 + SPREAD,
+        "brought nothing: .* is 0.3 ± 0.2 nats above .*ESS 60 % .50 %.",
+    ),
     "lower": (5.0, 5.0, 4.0 + SPREAD, "brought nothing: its bound is -1 ± 0.2 nats above"),
-    "few": (5.0, 5.0, 6.0 + SPREAD[:8], "may have brought nothing: 8 .* differences are too few to tell"),
+    "few": (
+        5.0,
+        5.0,
+        6.0 + SPREAD[:8],
+        "may have brought nothing: 8 .* differences are too few to tell",
+    ),
     "gain": (5.0, 5.0, 6.0 + SPREAD, None),
     "a-guide-that-fails": (-np.inf, np.nan, 6.0 + SPREAD, None),
     "both-fail": (-np.inf, np.nan, np.nan * SPREAD, "brought nothing: its bound is nan"),
@@ -538,7 +687,9 @@ GAINS = {
 
 @pytest.mark.parametrize(("value", "guide", "network", "said"), GAINS.values(), ids=GAINS)
 def test_what_training_has_brought(value, guide, network, said):
-    """The mean of the differences, path by path, and its standard error; a warning where it is nothing."""
+    """The mean of the differences, path by path, and its standard error; a warning where it is
+    nothing.
+    """
     before = jnp.array(value), jnp.array(guide), jnp.array(0.5), jnp.full(network.size, guide)
     after = jnp.zeros(()), jnp.mean(network), jnp.array(0.6), jnp.asarray(network)
     with warnings.catch_warnings(record=True) as caught:
@@ -567,17 +718,24 @@ def randomised(network, key):
 
 def curve(n):
     s = 2 * np.pi * np.arange(n) / n
-    return np.stack([np.cos(s), np.sin(s) + 0.2 * np.cos(2 * s)], 1), 0.2 * np.stack([np.sin(3 * s), np.cos(s)], 1)
+    return np.stack([np.cos(s), np.sin(s) + 0.2 * np.cos(2 * s)], 1), 0.2 * np.stack(
+        [np.sin(3 * s), np.cos(s)], 1
+    )
 
 
 def test_networks_start_at_zero(key):
     v, x = curve(5)
-    for make in (lambda: nb.scores.MLP((5, 2), 1, key=key), lambda: nb.scores.PointNetwork(2, 1, key=key)):
+    for make in (
+        lambda: nb.scores.MLP((5, 2), 1, key=key),
+        lambda: nb.scores.PointNetwork(2, 1, key=key),
+    ):
         assert not np.any(make()(jnp.array(0.3), x, v, jnp.ones(1)))
 
 
 def test_the_singular_part_of_a_network(key):
-    """(network(t, x/l, v, θ) + g(t) x/l)/l with l = √(1 − t + softness); 0 as long as its parts are."""
+    """(network(t, x/l, v, θ) + g(t) x/l)/l with l = √(1 − t + softness); 0 as long as its parts
+    are.
+    """
     v, x = (jnp.asarray(a) for a in curve(5))
     network = nb.scores.Singular(nb.scores.MLP((5, 2), 1, key=key), key=key, softness=0.01)
     t, theta = jnp.array(0.9), jnp.ones(1)
@@ -585,7 +743,8 @@ def test_the_singular_part_of_a_network(key):
     network = randomised(network, key)
     length = np.sqrt(0.11)
     here, doubled = (
-        network(t, c * x, v, theta) - network.network(t, c * x / length, v, theta) / length for c in (1, 2)
+        network(t, c * x, v, theta) - network.network(t, c * x / length, v, theta) / length
+        for c in (1, 2)
     )
     gain = np.asarray(here)[1, 0] * 0.11 / np.asarray(x)[1, 0]
     assert abs(gain) > 1e-3
@@ -594,13 +753,17 @@ def test_the_singular_part_of_a_network(key):
 
 
 def test_a_point_network_sees_a_set_of_points(key):
-    """It commutes with relabelling, and has a limit in the number of points, reached fast on a smooth curve."""
+    """It commutes with relabelling, and has a limit in the number of points, reached fast on a
+    smooth curve.
+    """
     network = eqx.filter_jit(randomised(nb.scores.PointNetwork(2, 1, key=key, width=8), key))
     t, theta = jnp.array(0.3), jnp.ones(1)
     v, x = (jnp.asarray(a) for a in curve(8))
     order = np.random.default_rng(0).permutation(8)
     found = network(t, x, v, theta)
-    np.testing.assert_allclose(network(t, x[order], v[order], theta), found[order], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(
+        network(t, x[order], v[order], theta), found[order], rtol=1e-8, atol=1e-10
+    )
     assert np.ptp(np.asarray(found)) > 1e-3
     limit = network(t, *(jnp.asarray(a) for a in curve(128)[::-1]), theta)[::16]
     gaps = []
@@ -618,7 +781,9 @@ def test_a_guide_of_landmarks_does_not_see_translations(key):
     @jax.jit
     def network_score(shift):
         flow = nb.KunitaFlow(nb.Landmarks(6, 2), nb.GaussianKernel(0.3, 0.7))
-        bridge = nb.GuidedBridge(flow, nb.InexactMatch(0.1).at(v + shift[None]), x0=v, ts=[0.0, 0.5, 1.0], guide=guide)
+        bridge = nb.GuidedBridge(
+            flow, nb.InexactMatch(0.1).at(v + shift[None]), x0=v, ts=[0.0, 0.5, 1.0], guide=guide
+        )
         return bridge.score(0.5, v + 0.3 * x0 + shift[None])
 
     here, there = network_score(jnp.zeros(2)), network_score(jnp.array([0.7, -1.2]))
@@ -646,7 +811,9 @@ def test_a_network_with_running_means():
     before, after = (jax.tree.leaves(n.state) for n in (network, score.network))
     assert any(not np.array_equal(a, b) for a, b in zip(before, after, strict=True))
     assert np.all(np.isfinite(score.history["loss"][1:]))
-    assert score.network(jnp.array(0.5), jnp.ones((1, 2)), jnp.ones((1, 2)), jnp.zeros(0)).shape == (1, 2)
+    assert score.network(
+        jnp.array(0.5), jnp.ones((1, 2)), jnp.ones((1, 2)), jnp.zeros(0)
+    ).shape == (1, 2)
 
 
 # All of it.
@@ -654,9 +821,13 @@ def test_a_network_with_running_means():
 QUICK = nb.scores.Training(10, 8, interval=5, held_out=8)
 
 
-@pytest.mark.parametrize("method", ["residual", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["residual", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)]
+)
 def test_an_exact_guide_is_not_spoilt(method):
-    """Weights stay constant: Brownian motion and its own guide; and it is said that there was nothing to learn."""
+    """Weights stay constant: Brownian motion and its own guide; and it is said that there was
+    nothing to learn.
+    """
     sde, match = nb.LinearSDE(-0.5, 0.4, 0.3), nb.InexactMatch(0.1).at([0.3])
     if method == "reversal":
         sde, match = nb.BrownianMotion(0.5), nb.ExactMatch().at([0.3])
@@ -675,12 +846,18 @@ def test_an_exact_guide_is_not_spoilt(method):
 
 
 def test_an_amortised_guide_serves_other_parameters_and_targets():
-    """Trained over (rate, target): more effective paths than its guide has, at pairs not drawn in training."""
+    """Trained over (rate, target): more effective paths than its guide has, at pairs not drawn in
+    training.
+    """
     guide, match = nb.FrozenGuide(nb.BrownianMotion(0.25)), nb.ExactMatch()
 
     def draw(key):
         rate, v = jr.uniform(key, (2,))
-        return nb.LinearSDE(-0.5 - 3 * rate, 0.5), match.at(jnp.stack([2 * v - 1])), jnp.array([0.3])
+        return (
+            nb.LinearSDE(-0.5 - 3 * rate, 0.5),
+            match.at(jnp.stack([2 * v - 1])),
+            jnp.array([0.3]),
+        )
 
     sde, condition, x0 = draw(jr.key(0))
     score = nb.scores.fit(
@@ -712,7 +889,9 @@ def test_an_amortised_guide_serves_other_parameters_and_targets():
     assert after < 0.25 * before
 
     def log_density(rate, z):
-        law = nb.DiffusionEndpoint(nb.LinearSDE(-rate, 0.5), x0, match, t1=1.0, num_steps=10, guide=score)
+        law = nb.DiffusionEndpoint(
+            nb.LinearSDE(-rate, 0.5), x0, match, t1=1.0, num_steps=10, guide=score
+        )
 
         def model():
             numpyro.factor("fixed", 0.0)
@@ -723,7 +902,9 @@ def test_an_amortised_guide_serves_other_parameters_and_targets():
     z = jr.normal(jr.key(4), (10, 1, 1))
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         found = jax.jit(log_density)(1.7, z)
-        bridge = nb.GuidedBridge(nb.LinearSDE(-1.7, 0.5), match.at([0.2]), x0=x0, t1=1.0, num_steps=10, guide=score)
+        bridge = nb.GuidedBridge(
+            nb.LinearSDE(-1.7, 0.5), match.at([0.2]), x0=x0, t1=1.0, num_steps=10, guide=score
+        )
         np.testing.assert_allclose(found, bridge.log_weight(z), rtol=1e-10)
 
 
@@ -740,9 +921,13 @@ def sine_evidence(ts, v=np.pi / 2):
     return np.log(np.sum(step(0.0, grid, dts[0]) * h) * (grid[1] - grid[0]))
 
 
-@pytest.mark.parametrize("method", ["residual", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", ["residual", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)]
+)
 def test_the_sine_bridge(method):
-    """A multimodal bridge, where a Brownian guide has an ESS of 0.3 %: twenty times that; the evidence within 3 SE."""
+    """A multimodal bridge, where a Brownian guide has an ESS of 0.3 %: twenty times that; the
+    evidence within 3 SE.
+    """
     match = nb.ExactMatch().at([np.pi / 2])
     guide = nb.FrozenGuide(nb.BrownianMotion(0.25))
     score = nb.scores.fit(
@@ -760,7 +945,9 @@ def test_the_sine_bridge(method):
     )
     bridge = nb.GuidedBridge(SINE, match, x0=[0.0], t1=1.0, num_steps=40, guide=guide)
     z = jr.normal(jr.key(2), (4000, *bridge.noise_shape))
-    plain, log_weight = (np.asarray(jax.jit(jax.vmap(b.log_weight))(z)) for b in (bridge, bridge.with_guide(score)))
+    plain, log_weight = (
+        np.asarray(jax.jit(jax.vmap(b.log_weight))(z)) for b in (bridge, bridge.with_guide(score))
+    )
     truth = sine_evidence(np.asarray(bridge.ts))
     assert abs(truth + 0.2610) < 0.02  # the Euler model of 40 steps and the diffusion
     weight = np.exp(log_weight - truth)

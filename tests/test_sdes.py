@@ -1,4 +1,6 @@
-"""SDEs against the same processes in plain NumPy: coefficients, steps, linearisations, simulated laws, closed forms."""
+"""SDEs against the same processes in plain NumPy: coefficients, steps, linearisations, simulated
+laws, closed forms.
+"""
 
 import itertools
 
@@ -48,10 +50,13 @@ def test_an_sde_is_its_process(name, key):
     x0 = x0 + 0.1 * np.asarray(jr.normal(key_x, x0.shape))
     ts = np.array([0.2, 0.5, 0.9])
     n, x, (s, t) = len(x0), jnp.asarray(x0), ts[:2]
-    b, sigma, a = (f(s, columns(x0)) for f in (process.drift, process.diffusion, process.covariance))
+    b, sigma, a = (
+        f(s, columns(x0)) for f in (process.drift, process.diffusion, process.covariance)
+    )
     mean, factor = process.step(s, t, columns(x0))
     z = np.asarray(jr.normal(key_z, (2, max(factor.shape[1], sigma.shape[1]), b.shape[1])))
-    z_model, z_euler = z[:, : factor.shape[1]], z[:, : sigma.shape[1]]  # a diffrax solver steps σ itself
+    # a diffrax solver steps σ itself
+    z_model, z_euler = z[:, : factor.shape[1]], z[:, : sigma.shape[1]]
     assert sde.noise_size(x) == factor.shape[1]
 
     @jax.jit
@@ -84,7 +89,9 @@ def test_an_sde_is_its_process(name, key):
 
 
 def test_diffrax_solves_it(key):
-    """`terms` in `diffrax.diffeqsolve`, and on the same noise `simulate`: both step by Euler–Maruyama."""
+    """`terms` in `diffrax.diffeqsolve`, and on the same noise `simulate`: both step by
+    Euler–Maruyama.
+    """
     sde, _, x0 = SDES["user-planar"]()
     x, ts = jnp.asarray(x0), jnp.linspace(0.0, 1.0, 6)
     z = jr.normal(key, (5, sde.noise_size(x), *x0.shape[1:]))
@@ -104,7 +111,9 @@ def test_diffrax_solves_it(key):
 
 
 def test_ornstein_uhlenbeck():
-    """dX = γ (μ − X) dt + σ dW has variance σ² (1 − e^{−2γτ})/2γ and cov(X_s, X_t) = e^{−γ(t−s)} var X_s."""
+    """dX = γ (μ − X) dt + σ dW has variance σ² (1 − e^{−2γτ})/2γ and cov(X_s, X_t) = e^{−γ(t−s)}
+    var X_s.
+    """
     rate, mean, sigma = 1.7, 0.8, 0.6
     sde = nb.LinearSDE(-rate, sigma, rate * mean)
     law = sde.transition(0.3, 1.1, jnp.array([2.0]))
@@ -113,7 +122,9 @@ def test_ornstein_uhlenbeck():
 
     count, ts = 20000, np.array([0.0, 0.5, 1.2])
     z = jr.normal(jr.key(0), (count, 2, 1, 1))
-    path = np.asarray(jax.jit(jax.vmap(lambda z: nb.simulate(sde, jnp.array([2.0]), jnp.asarray(ts), z)))(z))[..., 0]
+    path = np.asarray(
+        jax.jit(jax.vmap(lambda z: nb.simulate(sde, jnp.array([2.0]), jnp.asarray(ts), z)))(z)
+    )[..., 0]
     variance = sigma**2 * -np.expm1(-2 * rate * ts[1:]) / (2 * rate)
     truth = np.array([[variance[0], variance[0] * np.exp(-rate * 0.7)], [0.0, variance[1]]])
     truth[1, 0] = truth[0, 1]
@@ -125,7 +136,9 @@ def test_ornstein_uhlenbeck():
 
 
 def test_stochastic_heat_equation():
-    """dX_n = −κ n² X_n dt + σ dW_n: cov(X(s), X(s')) = v_0 + 2 Σ v_n cos n(s − s'), v_n = σ² (1 − e^{−2κn²t})/2κn²."""
+    """dX_n = −κ n² X_n dt + σ dW_n: cov(X(s), X(s')) = v_0 + 2 Σ v_n cos n(s − s'), v_n = σ² (1 −
+    e^{−2κn²t})/2κn².
+    """
     kappa, sigma, t = 0.3, 0.5, 0.7
     space = nb.FourierBasis(4, 2)
     frequencies = (np.arange(9) + 1) // 2
@@ -145,7 +158,9 @@ def test_stochastic_heat_equation():
 
 @pytest.mark.parametrize("rate", [1.0, 40.0, 400.0])
 def test_stiff_matrices(rate):
-    """Symmetric drift: S = U diag((e^{2λτ} − 1)/2λ) Uᵀ. Van Loan's block exponential loses it where λτ is large."""
+    """Symmetric drift: S = U diag((e^{2λτ} − 1)/2λ) Uᵀ. Van Loan's block exponential loses it where
+    λτ is large.
+    """
     c, s = np.cos(0.4), np.sin(0.4)
     U, values = np.array([[c, -s], [s, c]]), np.array([-0.1, -rate])
     sde = nb.LinearSDE((U * values) @ U.T, 0.7, 0.3)
@@ -156,19 +171,27 @@ def test_stiff_matrices(rate):
 
 
 def test_a_matrix_step_against_scipy():
-    """e^{Bτ} from `scipy.linalg.expm`, the integrals from quadrature; a planar state, a shift for each column."""
+    """e^{Bτ} from `scipy.linalg.expm`, the integrals from quadrature; a planar state, a shift for
+    each column.
+    """
     beta = np.array([[0.1, -0.4], [0.0, 0.2], [-1.0, 0.5]])
     sde, dt = nb.LinearSDE(DENSE, R, beta), 1.3
     x = CURVE
     law = jax.jit(lambda x: sde.transition(0.4, 0.4 + dt, x))(x)
-    shift, _ = scipy.integrate.quad_vec(lambda u: scipy.linalg.expm(DENSE * u) @ beta, 0, dt, epsabs=1e-13)
+    shift, _ = scipy.integrate.quad_vec(
+        lambda u: scipy.linalg.expm(DENSE * u) @ beta, 0, dt, epsabs=1e-13
+    )
     C, _ = scipy.integrate.quad_vec(
-        lambda u: scipy.linalg.expm(DENSE * u) @ R @ R.T @ scipy.linalg.expm(DENSE * u).T, 0, dt, epsabs=1e-13
+        lambda u: scipy.linalg.expm(DENSE * u) @ R @ R.T @ scipy.linalg.expm(DENSE * u).T,
+        0,
+        dt,
+        epsabs=1e-13,
     )
     close(law.mean, scipy.linalg.expm(DENSE * dt) @ x + shift)
     close(law.factor @ law.factor.T, C)
     twice, once, rest = (exact_affine(DENSE, beta, R, u) for u in (2.0, 0.7, 1.3))
-    close(twice[2], rest[0] @ once[2] @ rest[0].T + rest[2])  # the referee of the other tests is a semigroup
+    # the referee of the other tests is a semigroup
+    close(twice[2], rest[0] @ once[2] @ rest[0].T + rest[2])
 
 
 def test_small_rates_are_brownian():
@@ -178,7 +201,9 @@ def test_small_rates_are_brownian():
     close(law.covariance, 0.5, 1e-8)
     law = nb.LinearSDE(0.0, 0.5, 0.3).transition(0.0, 2.0, jnp.array([1.0]))
     close(law.mean, [1.6], 1e-15)
-    gradient = jax.grad(lambda b: nb.LinearSDE(b, 0.5).transition(0.0, 2.0, jnp.array([1.0])).covariance)
+    gradient = jax.grad(
+        lambda b: nb.LinearSDE(b, 0.5).transition(0.0, 2.0, jnp.array([1.0])).covariance
+    )
     close(gradient(1e-6), 0.25 * 2.0**2, 1e-5)  # d/db ∫ σ² e^{2bu} du = σ² τ² at b = 0
     assert np.isfinite(gradient(0.0))
 
@@ -187,12 +212,16 @@ def test_small_rates_are_brownian():
 
 
 def test_law_of_euler_steps():
-    """dX = μ X dt + σ X dW: E X_K = x (1 + μ dt)^K, E X_K² = x² ((1 + μ dt)² + σ² dt)^K, the SE below 1 %."""
+    """dX = μ X dt + σ X dW: E X_K = x (1 + μ dt)^K, E X_K² = x² ((1 + μ dt)² + σ² dt)^K, the SE
+    below 1 %.
+    """
     mu, sigma, x0, K, count = 0.3, 0.4, 1.2, 8, 20000
     sde = nb.SDE(lambda t, x, args: args[0] * x, lambda t, x, args: args[1] * x, (mu, sigma))
     ts = jnp.linspace(0.0, 1.0, K + 1)
     z = jr.normal(jr.key(1), (count, K, 1, 1))
-    end = np.asarray(jax.jit(jax.vmap(lambda z: nb.simulate(sde, jnp.array([x0]), ts, z)))(z))[:, -1, 0]
+    end = np.asarray(jax.jit(jax.vmap(lambda z: nb.simulate(sde, jnp.array([x0]), ts, z)))(z))[
+        :, -1, 0
+    ]
     for found, truth in (
         (end, x0 * (1 + mu / K) ** K),
         (end**2, x0**2 * ((1 + mu / K) ** 2 + sigma**2 / K) ** K),
@@ -208,8 +237,17 @@ def test_has_constant_covariance_follows_the_state():
     def looped(t, x, args):
         return jax.lax.fori_loop(0, 3, lambda i, s: s * (1 + 0.1 * jnp.tanh(x[0])), jnp.ones(3))
 
-    fixed = [lambda t, x, a: 0.5, lambda t, x, a: a, lambda t, x, a: jnp.ones(x.shape), lambda t, x, a: jnp.diag(a) * t]
-    moving = [lambda t, x, a: jax.jit(jnp.sin)(x), looped, lambda t, x, a: jnp.where(x > 0, 0.1, 0.2)]
+    fixed = [
+        lambda t, x, a: 0.5,
+        lambda t, x, a: a,
+        lambda t, x, a: jnp.ones(x.shape),
+        lambda t, x, a: jnp.diag(a) * t,
+    ]
+    moving = [
+        lambda t, x, a: jax.jit(jnp.sin)(x),
+        looped,
+        lambda t, x, a: jnp.where(x > 0, 0.1, 0.2),
+    ]
     for constant, functions in ((True, fixed), (False, moving)):
         for diffusion in functions:
             sde = nb.SDE(lambda t, x, a: -x, diffusion, jnp.array([0.1, 0.2, 0.3]))
@@ -230,16 +268,26 @@ MODES = {1: 12, 2: 9, 3: 5}
 
 def kunita_covariance(x, y, dim, alpha=ALPHA, ell=ELL):
     """α² (πℓ²)^{d/2} exp(−|x − x'|²/4ℓ²)."""
-    return alpha**2 * (np.pi * ell**2) ** (dim / 2) * np.exp(-np.sum((x[:, None] - y[None]) ** 2, -1) / (4 * ell**2))
+    return (
+        alpha**2
+        * (np.pi * ell**2) ** (dim / 2)
+        * np.exp(-np.sum((x[:, None] - y[None]) ** 2, -1) / (4 * ell**2))
+    )
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
 def test_every_noise_has_the_covariance_of_the_field(dim):
-    """Landmark noise to its jitter; spectral and grid noise below 1e-6 where the box is wide and fine enough."""
+    """Landmark noise to its jitter; spectral and grid noise below 1e-6 where the box is wide and
+    fine enough.
+    """
     x, kernel = POINTS[dim], nb.GaussianKernel(ALPHA, ELL)
     truth = kunita_covariance(x, x, dim)
     spectral = nb.SpectralNoise(MODES[dim], period=7.0)
-    noises = [("landmark", 1e-9), (spectral, 1e-3 if dim == 3 else 1e-6), (nb.GridNoise(-4.0, 4.0, 20), 1e-6)]
+    noises = [
+        ("landmark", 1e-9),
+        (spectral, 1e-3 if dim == 3 else 1e-6),
+        (nb.GridNoise(-4.0, 4.0, 20), 1e-6),
+    ]
     for noise, atol in noises:
         flow = nb.KunitaFlow(nb.Landmarks(3, dim), kernel, noise=noise)
         sigma, a = jax.jit(lambda x, flow=flow: flow.noise(0.0, x))(x)
@@ -256,7 +304,9 @@ def test_spectral_noise_reports_its_error():
     noise = nb.SpectralNoise(modes, period=period, diameter=diameter)
     flow = nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(ALPHA, ELL), noise=noise)
     error = jax.jit(lambda: flow.noise_error())()
-    omega = 2 * np.pi / period * np.array(list(itertools.product(range(-modes, modes + 1), repeat=2)))
+    omega = (
+        2 * np.pi / period * np.array(list(itertools.product(range(-modes, modes + 1), repeat=2)))
+    )
     q = ALPHA**2 * (2 * np.pi * ELL**2) ** 2 * np.exp(-(ELL**2) * np.sum(omega**2, 1)) / period**2
     close(error["tail"], 1 - q.sum() / (ALPHA**2 * np.pi * ELL**2), 1e-12)
     close(error["wrap_around"], np.exp(-((period - diameter) ** 2) / (4 * ELL**2)), 1e-12)
@@ -270,16 +320,22 @@ def test_the_default_period_keeps_the_wrap_around_at_1e_8():
 
 
 @pytest.mark.parametrize(
-    "noise", [nb.SpectralNoise(9, period=9.0), nb.GridNoise(-4.0, 4.0, 20)], ids=["spectral", "grid"]
+    "noise",
+    [nb.SpectralNoise(9, period=9.0), nb.GridNoise(-4.0, 4.0, 20)],
+    ids=["spectral", "grid"],
 )
 def test_projected_covariance(noise):
-    """a_ij = (2π)^{-2} ∬ φ_i(s) a(x(s), x(s')) φ_j(s') ds ds' of a curve, by the trapezoidal rule on 96 points."""
+    """a_ij = (2π)^{-2} ∬ φ_i(s) a(x(s), x(s')) φ_j(s') ds ds' of a curve, by the trapezoidal rule
+    on 96 points.
+    """
     space = nb.FourierBasis(3, 2, num_quadrature=48)
     x = np.zeros((7, 2))
     x[1], x[2], x[4] = [0.6, 0.1], [0.0, 0.5], [0.1, -0.1]
     q = 96
     s = 2 * np.pi * np.arange(q) / q
-    phi = np.stack([np.ones(q), *(np.sqrt(2) * f(k * s) for k in (1, 2, 3) for f in (np.cos, np.sin))], 1)
+    phi = np.stack(
+        [np.ones(q), *(np.sqrt(2) * f(k * s) for k in (1, 2, 3) for f in (np.cos, np.sin))], 1
+    )
     truth = phi.T @ kunita_covariance(phi @ x, phi @ x, 2) @ phi / q**2
     flow = nb.KunitaFlow(space, nb.GaussianKernel(ALPHA, ELL), noise=noise)
     sigma, a = jax.jit(lambda x: flow.noise(0.0, x))(x)
@@ -288,19 +344,23 @@ def test_projected_covariance(noise):
 
 
 def test_coarse_to_fine(key):
-    """Noise fixed in space moves a curve alike at every resolution: landmarks pathwise, a basis by its leading rows."""
+    """Noise fixed in space moves a curve alike at every resolution: landmarks pathwise, a basis by
+    its leading rows.
+    """
     noise, kernel = nb.SpectralNoise(5, period=8.0), nb.GaussianKernel(ALPHA, ELL)
     s = 2 * np.pi * np.arange(8) / 8
     curve = np.stack([np.cos(s), 0.7 * np.sin(s)], 1)
     coarse, fine = (nb.KunitaFlow(nb.Landmarks(n, 2), kernel, noise=noise) for n in (4, 8))
     ts = jnp.array([0.0, 0.4, 1.0])
     z = jr.normal(key, (2, coarse.noise_size(jnp.asarray(curve[::2])), 2))
-    path, at_every_other = jax.jit(lambda z: (nb.simulate(fine, curve, ts, z), nb.simulate(coarse, curve[::2], ts, z)))(
-        z
-    )
+    path, at_every_other = jax.jit(
+        lambda z: (nb.simulate(fine, curve, ts, z), nb.simulate(coarse, curve[::2], ts, z))
+    )(z)
     close(at_every_other, path[:, ::2], 1e-13)
 
-    few, many = (nb.KunitaFlow(nb.FourierBasis(m, 2, num_quadrature=32), kernel, noise=noise) for m in (2, 4))
+    few, many = (
+        nb.KunitaFlow(nb.FourierBasis(m, 2, num_quadrature=32), kernel, noise=noise) for m in (2, 4)
+    )
     x = np.zeros((9, 2))
     x[1, 0], x[2, 1] = 0.7, 0.5
     leading, sigma = jax.jit(lambda x: (few.diffusion(0.0, x[:5]), many.diffusion(0.0, x)))(x)
@@ -309,11 +369,20 @@ def test_coarse_to_fine(key):
 
 @pytest.mark.parametrize("noise", ["landmark", "spectral", "grid"])
 def test_ito_and_stratonovich(noise):
-    """The correction ½ Σ_ω ∂_c σ_ω(x_i) σ_ω(x_i), summed over what moves point i, vanishes where the flow says so."""
-    noises = {"landmark": "landmark", "spectral": nb.SpectralNoise(4, period=6.0), "grid": nb.GridNoise(-4.0, 4.0, 20)}
+    """The correction ½ Σ_ω ∂_c σ_ω(x_i) σ_ω(x_i), summed over what moves point i, vanishes where
+    the flow says so.
+    """
+    noises = {
+        "landmark": "landmark",
+        "spectral": nb.SpectralNoise(4, period=6.0),
+        "grid": nb.GridNoise(-4.0, 4.0, 20),
+    }
     flow = nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(ALPHA, ELL), noise=noises[noise])
     x = jnp.asarray(CURVE)
-    sigma, derivative = flow.diffusion(0.0, x), jax.jit(jax.jacfwd(lambda y: flow.diffusion(0.0, y)))(x)
+    sigma, derivative = (
+        flow.diffusion(0.0, x),
+        jax.jit(jax.jacfwd(lambda y: flow.diffusion(0.0, y)))(x),
+    )
     correction = 0.5 * np.einsum("iwjc,jw->ic", derivative, sigma)
     assert flow.ito_is_stratonovich(x) == (noise != "landmark")
     assert (np.max(np.abs(correction)) < 1e-8) == flow.ito_is_stratonovich(x)

@@ -1,4 +1,6 @@
-"""Semilinear equations: steps against dense matrices, evidence against quadrature, resolution, guides along a path."""
+"""Semilinear equations: steps against dense matrices, evidence against quadrature, resolution,
+guides along a path.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,11 @@ RNG = np.random.default_rng(5)
 MATRIX = RNG.normal(size=(4, 4)) - 2 * np.eye(4)
 DIAGONAL = -np.array([0.0, 0.3, 4.0, 400.0])
 LINEAR = {"scalar": -0.7, "diagonal": DIAGONAL, "matrix": MATRIX}
-DIFFUSION = {"scalar": 0.4, "diagonal": np.array([0.1, 0.5, 1.0, 2.0]), "tall": RNG.normal(size=(4, 2))}
+DIFFUSION = {
+    "scalar": 0.4,
+    "diagonal": np.array([0.1, 0.5, 1.0, 2.0]),
+    "tall": RNG.normal(size=(4, 2)),
+}
 
 
 def bend(t, x, args):
@@ -49,7 +55,9 @@ def test_a_step_is_that_of_the_process_with_what_is_not_linear_held(linear, diff
     np.testing.assert_allclose(step.mean, flow @ x + shift, rtol=1e-10)
     factor = np.asarray(promote(step.factor, 2, 4))
     np.testing.assert_allclose(factor @ factor.T, covariance, atol=1e-9 * covariance.max())
-    np.testing.assert_allclose(promote(step.covariance, 2, 4), covariance, atol=1e-9 * covariance.max())
+    np.testing.assert_allclose(
+        promote(step.covariance, 2, 4), covariance, atol=1e-9 * covariance.max()
+    )
     assert sde.noise_size(jnp.asarray(x)) == factor.shape[1]
 
 
@@ -58,21 +66,32 @@ def test_without_a_nonlinearity_it_is_the_linear_process(key):
     linear = nb.LinearSDE(DIAGONAL, DIFFUSION["diagonal"])
     semilinear = nb.SemilinearSDE(DIAGONAL, lambda t, x, args: 0 * x, DIFFUSION["diagonal"])
     for match in (nb.InexactMatch(0.1), nb.ExactMatch()):
-        bridges = [nb.GuidedBridge(sde, match.at(v), x0=x0, t1=1.0, num_steps=5) for sde in (linear, semilinear)]
+        bridges = [
+            nb.GuidedBridge(sde, match.at(v), x0=x0, t1=1.0, num_steps=5)
+            for sde in (linear, semilinear)
+        ]
         z = jr.normal(key, bridges[0].noise_shape)
-        for found, expected in zip(*(b.path_and_log_weight(z) for b in reversed(bridges)), strict=True):
+        for found, expected in zip(
+            *(b.path_and_log_weight(z) for b in reversed(bridges)), strict=True
+        ):
             np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.parametrize("linear", LINEAR)
 @pytest.mark.parametrize("rounds", [0, 2])
 def test_a_linear_pull_has_one_weight(linear, rounds, key, K=6):
-    """The process linearised is the process: the weight is the density of the scheme's dense Gaussian chain."""
+    """The process linearised is the process: the weight is the density of the scheme's dense
+    Gaussian chain.
+    """
     A, slope, shift = LINEAR[linear], RNG.normal(size=(4, 4)), RNG.normal(size=4)
     x0, v = RNG.normal(size=(2, 4))
-    sde = nb.SemilinearSDE(A, lambda t, x, args: args[0] @ x + args[1], 0.5, (jnp.asarray(slope), jnp.asarray(shift)))
+    sde = nb.SemilinearSDE(
+        A, lambda t, x, args: args[0] @ x + args[1], 0.5, (jnp.asarray(slope), jnp.asarray(shift))
+    )
     match = nb.InexactMatch(0.2)
-    bridge = nb.GuidedBridge(sde, match.at(v), x0=x0, t1=0.9, num_steps=K, guide=nb.FrozenGuide(rounds=rounds))
+    bridge = nb.GuidedBridge(
+        sde, match.at(v), x0=x0, t1=0.9, num_steps=K, guide=nb.FrozenGuide(rounds=rounds)
+    )
     mean, covariance = x0, np.zeros((4, 4))
     eye = np.eye(4)
     for _ in range(K):
@@ -87,7 +106,9 @@ def test_a_linear_pull_has_one_weight(linear, rounds, key, K=6):
 
 
 def chapman_kolmogorov(step_law, grid, x0, times, observe):
-    """log of the integral of the scheme's own densities on a grid; `observe(k, x)`: log density of what is seen."""
+    """log of the integral of the scheme's own densities on a grid; `observe(k, x)`: log density of
+    what is seen.
+    """
     h = grid[1] - grid[0]
     density = None
     for k, (s, t) in enumerate(zip(times[:-1], times[1:], strict=True)):
@@ -144,7 +165,9 @@ CONSTANT, VARYING = (lambda x: 0.6 + 0 * x), (lambda x: 0.5 + 0.3 * np.cos(x))
 def test_evidence_is_that_of_quadrature(diffusion, guide):
     times = np.linspace(0, 1, K1 + 1)
     law = one_step(diffusion)
-    expected = chapman_kolmogorov(law, np.linspace(-4, 5, 4001), -0.5, times, seen([1.3], VARIANCE, [K1]))
+    expected = chapman_kolmogorov(
+        law, np.linspace(-4, 5, 4001), -0.5, times, seen([1.3], VARIANCE, [K1])
+    )
     sde = nb.SemilinearSDE(A1, pulled, 0.6 if diffusion is CONSTANT else rough)
     condition = nb.InexactMatch(VARIANCE).at([1.3])
     bridge = nb.GuidedBridge(sde, condition, x0=[-0.5], t1=1.0, num_steps=K1, guide=guide)
@@ -159,7 +182,9 @@ def test_one_step_has_the_closed_form():
     mean = np.exp(-0.5) * 0.1 - np.expm1(-0.5) * np.sin(0.1)
     variance = -0.25 * np.expm1(-1.0) / 2 + 0.1
     expected = -0.5 * (0.3 - mean) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)
-    np.testing.assert_allclose(bridge.log_weight(np.zeros(bridge.noise_shape)), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        bridge.log_weight(np.zeros(bridge.noise_shape)), expected, rtol=1e-12
+    )
 
 
 def test_one_step_by_the_midpoint_has_the_closed_form():
@@ -169,12 +194,18 @@ def test_one_step_by_the_midpoint_has_the_closed_form():
     mean = np.exp(-0.5) * 0.1 - np.expm1(-0.5) * np.sin(half)
     variance = -0.25 * np.expm1(-1.0) / 2 * np.exp(0.5 * np.cos(half)) + 0.1
     expected = -0.5 * (0.3 - mean) ** 2 / variance - 0.5 * np.log(2 * np.pi * variance)
-    np.testing.assert_allclose(bridge.log_weight(np.zeros(bridge.noise_shape)), expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        bridge.log_weight(np.zeros(bridge.noise_shape)), expected, rtol=1e-12
+    )
 
 
-@pytest.mark.parametrize("A", [-1.0, [-1.0, -3.0], [[-1.0, 0.6], [-0.2, -3.0]]], ids=["scalar", "diagonal", "matrix"])
+@pytest.mark.parametrize(
+    "A", [-1.0, [-1.0, -3.0], [[-1.0, 0.6], [-0.2, -3.0]]], ids=["scalar", "diagonal", "matrix"]
+)
 def test_order_of_the_schemes(A):
-    """Mean and covariance at t = 1 of dX = (A X + S X) dt + σ dW, against the exact law: halving steps, 1/2 and 1/4."""
+    """Mean and covariance at t = 1 of dX = (A X + S X) dt + σ dW, against the exact law: halving
+    steps, 1/2 and 1/4.
+    """
     A, S, sigma = np.array(A), np.array([0.7, -0.4]), np.array([0.5, 0.8])
     x0, one = np.array([1.0, -0.5]), np.eye(2)
     whole = (A if A.ndim == 2 else A * one) + np.diag(S)
@@ -213,15 +244,22 @@ def test_a_chain_of_observations_is_that_of_quadrature():
     v, lengths, K = [0.4, 1.3], [0.5, 0.7], 4
     times = np.concatenate([np.linspace(0, 0.5, K + 1), 0.5 + np.linspace(0, 0.7, K + 1)[1:]])
     law = one_step(CONSTANT)
-    expected = chapman_kolmogorov(law, np.linspace(-4, 5, 4001), -0.5, times, seen(v, VARIANCE, [K, 2 * K]))
+    expected = chapman_kolmogorov(
+        law, np.linspace(-4, 5, 4001), -0.5, times, seen(v, VARIANCE, [K, 2 * K])
+    )
     sde = nb.SemilinearSDE(A1, pulled, 0.6)
-    tree = nb.Tree.from_parents([-1, 0, 1], [0.0, *lengths], names=["start", "first", "second"], observed=[1, 2])
+    tree = nb.Tree.from_parents(
+        [-1, 0, 1], [0.0, *lengths], names=["start", "first", "second"], observed=[1, 2]
+    )
     law = nb.DiffusionTree(sde, [-0.5], nb.InexactMatch(VARIANCE), tree=tree, num_steps=K)
     value = jnp.asarray(v)[:, None]
     noise = jr.normal(jr.key(1), (20_000, *law.noise_prior().shape()))
     weights = jax.jit(jax.vmap(lambda z: law.given(z).log_prob(value)))(noise)
     standard_error = nb.weights.standard_error(weights)
-    assert standard_error < 0.03 and abs(nb.weights.log_mean_exp(weights) - expected) < 4 * standard_error
+    assert (
+        standard_error < 0.03
+        and abs(nb.weights.log_mean_exp(weights) - expected) < 4 * standard_error
+    )
 
 
 def allen_cahn(num_modes, num_steps, **settings):
@@ -240,7 +278,9 @@ def allen_cahn(num_modes, num_steps, **settings):
 
 
 def test_resolution_changes_no_path_and_no_weight():
-    """The same noise of the modes that are shared, 67 and 129 functions: what the others add is of the size of q."""
+    """The same noise of the modes that are shared, 67 and 129 functions: what the others add is of
+    the size of q.
+    """
     z = jr.normal(jr.key(0), (20, 129, 1))
     coarse, fine = (allen_cahn(m, 20).path_and_log_weight(z[:, : 2 * m + 1]) for m in (33, 64))
     np.testing.assert_allclose(coarse[0], fine[0][:, :67], atol=1e-4)
@@ -255,7 +295,9 @@ def test_a_path_makes_a_better_linearisation_than_the_end():
 
 
 def test_scores_at_one_time_are_those_along_the_path(key):
-    """`log_h` and `score` linearise along the path of the bridge's start, whatever the state that they are asked of."""
+    """`log_h` and `score` linearise along the path of the bridge's start, whatever the state that
+    they are asked of.
+    """
     bridge = allen_cahn(4, 6)
     path = bridge.path(jr.normal(key, bridge.noise_shape))
     expected = bridge.scores(path)
@@ -286,7 +328,9 @@ def test_stiff_equations_are_stable_in_single_precision(key):
         space = FourierBasis(40, 1)
         sde = nb.SemilinearSDE(100.0 * space.laplacian, bend, 0.3, space=space)
         x0 = np.ones((space.size, 1), dtype)
-        bridge = nb.GuidedBridge(sde, nb.InexactMatch(0.1).at(0.1 * x0), x0=x0, t1=1.0, num_steps=10)
+        bridge = nb.GuidedBridge(
+            sde, nb.InexactMatch(0.1).at(0.1 * x0), x0=x0, t1=1.0, num_steps=10
+        )
         return bridge.path_and_log_weight(jnp.asarray(z, dtype))
 
     z = np.asarray(jr.normal(key, (10, 81, 1)))
@@ -299,7 +343,9 @@ def test_stiff_equations_are_stable_in_single_precision(key):
 
 
 def test_priors_on_everything_in_both_precisions():
-    """Generator, pull, noise, error and start, inside a model under jit: float32 within 2e-3 of the largest slope."""
+    """Generator, pull, noise, error and start, inside a model under jit: float32 within 2e-3 of the
+    largest slope.
+    """
     space = CosineBasis(3, 1)
     datum = np.array([0.3, -0.2, 0.1, 0.05])
 
@@ -309,14 +355,28 @@ def test_priors_on_everything_in_both_precisions():
             return space.from_points(rate * (u - u**3))
 
         def drawn(name, shape=()):
-            return numpyro.sample(name, dist.LogNormal(-1.0, 0.3).expand(shape).to_event(len(shape)))
+            return numpyro.sample(
+                name, dist.LogNormal(-1.0, 0.3).expand(shape).to_event(len(shape))
+            )
 
         linear = drawn("diffusivity") * space.laplacian
-        sde = nb.SemilinearSDE(linear, reaction, drawn("diffusion", (4,)), drawn("rate"), space=space)
+        sde = nb.SemilinearSDE(
+            linear, reaction, drawn("diffusion", (4,)), drawn("rate"), space=space
+        )
         match = nb.InexactMatch(drawn("variance"))
-        nb.sample("field", nb.DiffusionEndpoint(sde, drawn("start", (4,)), match, t1=0.5, num_steps=3), obs=datum)
+        nb.sample(
+            "field",
+            nb.DiffusionEndpoint(sde, drawn("start", (4,)), match, t1=0.5, num_steps=3),
+            obs=datum,
+        )
 
-    values = {"diffusivity": 0.1, "diffusion": np.full(4, 0.4), "rate": 0.7, "variance": 0.05, "start": 0.2 + datum**2}
+    values = {
+        "diffusivity": 0.1,
+        "diffusion": np.full(4, 0.4),
+        "rate": 0.7,
+        "variance": 0.05,
+        "start": 0.2 + datum**2,
+    }
     values |= {"field_noise": np.random.default_rng(0).normal(size=(3, 4, 1))}
 
     def value_and_gradient(dtype):
@@ -336,7 +396,12 @@ def test_priors_on_everything_in_both_precisions():
         np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3 * largest, err_msg=name)
 
 
-BASES = [FourierBasis(5, 1), SineBasis(6, 1, length=2.0), CosineBasis(6, 1, length=0.5), FourierSquare(2, 1)]
+BASES = [
+    FourierBasis(5, 1),
+    SineBasis(6, 1, length=2.0),
+    CosineBasis(6, 1, length=0.5),
+    FourierSquare(2, 1),
+]
 
 
 def name(space):
@@ -360,7 +425,9 @@ def test_a_basis_is_orthonormal_and_diagonalises_the_laplacian(space):
 
     for s in jnp.asarray(space.grid[[1, 3]]):
         laplacian = jnp.trace(jnp.atleast_2d(jax.hessian(value)(s)))
-        np.testing.assert_allclose(laplacian, space.evaluate(space.laplacian * x, s[None])[0], rtol=1e-8)
+        np.testing.assert_allclose(
+            laplacian, space.evaluate(space.laplacian * x, s[None])[0], rtol=1e-8
+        )
 
 
 def test_boundary_conditions():
@@ -371,7 +438,9 @@ def test_boundary_conditions():
     np.testing.assert_allclose(slope, 0, atol=1e-10)
 
 
-@pytest.mark.parametrize("space", [SineBasis(5, 1), CosineBasis(5, 1), FourierBasis(5, 1, num_quadrature=21)], ids=name)
+@pytest.mark.parametrize(
+    "space", [SineBasis(5, 1), CosineBasis(5, 1), FourierBasis(5, 1, num_quadrature=21)], ids=name
+)
 def test_cubic_fields_have_exact_coefficients(space):
     fine = type(space)(5, 1, num_quadrature=301)
     x = jnp.asarray(RNG.normal(size=space.size))
@@ -382,21 +451,51 @@ def test_cubic_fields_have_exact_coefficients(space):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: nb.SemilinearSDE(np.ones((3, 2)), bend, 1.0), r"`linear` must be .* square matrix .* \(3, 2\)"),
+        (
+            lambda: nb.SemilinearSDE(np.ones((3, 2)), bend, 1.0),
+            r"`linear` must be .* square matrix .* \(3, 2\)",
+        ),
         (lambda: nb.SemilinearSDE([1.0, np.nan], bend, 1.0), "`linear` must be finite"),
-        (lambda: nb.SemilinearSDE(-1.0, 2.0, 1.0), r"`nonlinearity` must be a function f\(t, x, args\).*got 2.0"),
-        (lambda: nb.SemilinearSDE(-1.0, lambda x: x, 1.0), "`nonlinearity` must be .* of three arguments"),
+        (
+            lambda: nb.SemilinearSDE(-1.0, 2.0, 1.0),
+            r"`nonlinearity` must be a function f\(t, x, args\).*got 2.0",
+        ),
+        (
+            lambda: nb.SemilinearSDE(-1.0, lambda x: x, 1.0),
+            "`nonlinearity` must be .* of three arguments",
+        ),
         (lambda: nb.SemilinearSDE(-1.0, bend, [np.inf]), "`diffusion` must be finite"),
-        (lambda: _bridge(nb.SemilinearSDE([-1.0, -2.0], bend, 1.0)), r"`linear` must be .* diagonal \(3,\).*\(2,\)"),
-        (lambda: _bridge(nb.SemilinearSDE(-1.0, lambda t, x, a: x[:2], 1.0)), r"`nonlinearity` must return .*\(2,\)"),
-        (lambda: _bridge(nb.SemilinearSDE(-1.0, bend, [1.0, 2.0])), r"`diffusion` must be .*got \(2,\)"),
+        (
+            lambda: _bridge(nb.SemilinearSDE([-1.0, -2.0], bend, 1.0)),
+            r"`linear` must be .* diagonal \(3,\).*\(2,\)",
+        ),
+        (
+            lambda: _bridge(nb.SemilinearSDE(-1.0, lambda t, x, a: x[:2], 1.0)),
+            r"`nonlinearity` must return .*\(2,\)",
+        ),
+        (
+            lambda: _bridge(nb.SemilinearSDE(-1.0, bend, [1.0, 2.0])),
+            r"`diffusion` must be .*got \(2,\)",
+        ),
         (lambda: nb.FrozenGuide(rounds=-1), "`rounds` must be an integer, at least 0; got -1"),
-        (lambda: nb.FrozenGuide(nb.BrownianMotion(1.0), rounds=1), "`rounds` linearise .* `auxiliary` is linear"),
+        (
+            lambda: nb.FrozenGuide(nb.BrownianMotion(1.0), rounds=1),
+            "`rounds` linearise .* `auxiliary` is linear",
+        ),
         (lambda: SineBasis(0, 1), "`num_modes` must be a positive integer"),
         (lambda: SineBasis(3, 1, length=0.0), "`length` must be a positive number; got 0.0"),
-        (lambda: CosineBasis(3, 1, num_quadrature=3), r"`num_quadrature` must be at least num_modes \+ 1 = 4.*got 3"),
-        (lambda: FourierSquare(1, 1).project(np.ones(10)), "`s` must be given, .*no square grid; got 10 points"),
-        (lambda: FourierSquare(1, 1).basis(np.ones(9)), r"`s` must be parameters \(m, 2\).*got shape \(9,\)"),
+        (
+            lambda: CosineBasis(3, 1, num_quadrature=3),
+            r"`num_quadrature` must be at least num_modes \+ 1 = 4.*got 3",
+        ),
+        (
+            lambda: FourierSquare(1, 1).project(np.ones(10)),
+            "`s` must be given, .*no square grid; got 10 points",
+        ),
+        (
+            lambda: FourierSquare(1, 1).basis(np.ones(9)),
+            r"`s` must be parameters \(m, 2\).*got shape \(9,\)",
+        ),
     ],
 )
 def test_what_is_refused(make, message):
@@ -405,4 +504,6 @@ def test_what_is_refused(make, message):
 
 
 def _bridge(sde):
-    return nb.GuidedBridge(sde, nb.InexactMatch(1.0).at(np.zeros(3)), x0=np.zeros(3), t1=1.0, num_steps=2)
+    return nb.GuidedBridge(
+        sde, nb.InexactMatch(1.0).at(np.zeros(3)), x0=np.zeros(3), t1=1.0, num_steps=2
+    )

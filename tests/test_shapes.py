@@ -41,13 +41,20 @@ class TestResample:
     def test_open_curve_keeps_both_ends(self):
         bend = [[0.0, 0.0], [1.0, 0.0], [1.0, 3.0]]
         np.testing.assert_allclose(
-            shapes.resample(bend, 5, closed=False), [[0, 0], [1, 0], [1, 1], [1, 2], [1, 3]], atol=1e-14
+            shapes.resample(bend, 5, closed=False),
+            [[0, 0], [1, 0], [1, 1], [1, 2], [1, 3]],
+            atol=1e-14,
         )
 
     @pytest.mark.parametrize("dim", [2, 3])
     @pytest.mark.parametrize("closed", [True, False])
     def test_equal_steps_along_a_smooth_curve(self, dim, closed):
-        t = np.linspace(0.0, 1.0, 4000, endpoint=not closed) ** 2 * 2.0 * np.pi * (1.0 if closed else 0.9)
+        t = (
+            np.linspace(0.0, 1.0, 4000, endpoint=not closed) ** 2
+            * 2.0
+            * np.pi
+            * (1.0 if closed else 0.9)
+        )
         curve = np.stack([3.0 * np.cos(t), np.sin(t), 0.5 * np.sin(2.0 * t)], axis=1)[:, :dim]
         points = shapes.resample(curve, 800, closed)
         ends = np.concatenate([points, points[:1]]) if closed else points
@@ -59,7 +66,9 @@ class TestResample:
     def test_repeated_vertices_do_not_matter(self, rng):
         points = rng.normal(size=(7, 2))
         repeated = np.concatenate([np.repeat(points, 2, axis=0), points[:1]])
-        np.testing.assert_allclose(shapes.resample(repeated, 20), shapes.resample(points, 20), atol=1e-12)
+        np.testing.assert_allclose(
+            shapes.resample(repeated, 20), shapes.resample(points, 20), atol=1e-12
+        )
 
     @pytest.mark.parametrize(
         ("points", "num_points", "message"),
@@ -101,12 +110,14 @@ class TestProcrustes:
         aligned, mean, _, converged = shapes.procrustes_align(copies)
         assert converged
         np.testing.assert_allclose(aligned, np.broadcast_to(mean, aligned.shape), atol=1e-12)
-        np.testing.assert_allclose(mean, shapes.unit_size(copies[0]), atol=1e-12)  # the first one's orientation
+        # the first one's orientation
+        np.testing.assert_allclose(mean, shapes.unit_size(copies[0]), atol=1e-12)
 
     @pytest.mark.parametrize("dim", [2, 3])
     def test_pair_against_scipy(self, rng, dim):
         _, (one, two) = scatter(rng, num_shapes=2, dim=dim)
-        # SciPy fits the second shape's size too: ‖one − s two‖² = 1 − ⟨one, two⟩² at unit centroid size.
+        # SciPy fits the second shape's size too: ‖one − s two‖² = 1 − ⟨one, two⟩² at unit centroid
+        # size.
         _, _, disparity = scipy.spatial.procrustes(one, two)
         aligned = shapes.procrustes_align(two[None], reference=one).shapes[0]
         inner = np.sum(aligned * shapes.unit_size(one)) / len(one)
@@ -121,7 +132,9 @@ class TestProcrustes:
         average = aligned.mean(axis=0)
         np.testing.assert_allclose(mean, shapes.unit_size(average) if scale else average, atol=1e-9)
         for shape in aligned:  # no rotation brings a shape nearer to the mean
-            best, _ = Rotation.align_vectors(*(np.pad(x, ((0, 0), (0, 3 - dim))) for x in (mean, shape)))
+            best, _ = Rotation.align_vectors(
+                *(np.pad(x, ((0, 0), (0, 3 - dim))) for x in (mean, shape))
+            )
             np.testing.assert_allclose(best.as_matrix(), np.eye(3), atol=1e-7)
         sizes = shapes.rms_radius(aligned)
         np.testing.assert_allclose(sizes, 1.0 if scale else shapes.rms_radius(copies))
@@ -179,13 +192,17 @@ class TestProcrustes:
         _, copies = scatter(rng)
         with pytest.raises(ValueError, match=r"shape \(N, n, 2\) or \(N, n, 3\), got \(9, 2\)"):
             shapes.procrustes_align(copies[0])
-        with pytest.raises(ValueError, match=r"`reference` must have the shape \(9, 2\), got \(4, 2\)"):
+        with pytest.raises(
+            ValueError, match=r"`reference` must have the shape \(9, 2\), got \(4, 2\)"
+        ):
             shapes.procrustes_align(copies, copies[0, :4])
         with pytest.raises(ValueError, match=r"`reference` must be finite"):
             shapes.procrustes_align(copies, np.full((9, 2), np.nan))
         holed = copies.copy()
         holed[2, 1:] = np.nan
-        with pytest.raises(ValueError, match=r"`shapes\[2\]` must have at least 2 seen points, got 1"):
+        with pytest.raises(
+            ValueError, match=r"`shapes\[2\]` must have at least 2 seen points, got 1"
+        ):
             shapes.procrustes_align(holed)
         holed = copies.copy()
         holed[:, 0] = np.nan
@@ -209,7 +226,7 @@ class TestMirrorImages:
         turned[few, :, dim - 1] *= -1.0
         specimens = [io.Specimen(shape, id=f"w{i}") for i, shape in enumerate(turned)]
         listed = ", ".join(rf"`shapes\[{i}\]` \('w{i}'\)" for i in few)
-        with pytest.warns(UserWarning, match=f"fits far better: {listed}. .*`reflect=\"auto\"`"):
+        with pytest.warns(UserWarning, match=f'fits far better: {listed}. .*`reflect="auto"`'):
             left = shapes.procrustes_align(specimens)
         assert np.flatnonzero(left.mirrored).tolist() == few
         mended = shapes.procrustes_align(specimens, reflect="auto")  # without a word
@@ -341,7 +358,9 @@ def test_mean_shape(rng):
 def test_align_start(rng, dim):
     base = rng.normal(size=(11, dim))
     shifts = [0, 3, 10]
-    moved = np.stack([2.0 * np.roll(base, shift, axis=0) @ turn(rng, dim) + 5.0 for shift in shifts])
+    moved = np.stack(
+        [2.0 * np.roll(base, shift, axis=0) @ turn(rng, dim) + 5.0 for shift in shifts]
+    )
     found = shapes.align_start(moved, base)
     for shape, original, shift in zip(found, moved, shifts, strict=True):
         np.testing.assert_array_equal(shape, np.roll(original, -shift, axis=0))
@@ -360,7 +379,9 @@ def test_alignment_of_papilio_is_geomorphs(shared_data):
 
 
 def test_rats_turn_back_from_their_registration(shared_data):
-    """Vilmann's rats are registered on two landmarks, so some coordinates are constant; aligned, none is."""
+    """Vilmann's rats are registered on two landmarks, so some coordinates are constant; aligned,
+    none is.
+    """
     rats = np.stack([rat.landmarks for rat in io.read_tps(shared_data / "rats" / "rats.tps")])
     assert np.ptp(rats[:, 4], axis=0).max() == 0.0
     alignment = shapes.procrustes_align(rats, scale=False)

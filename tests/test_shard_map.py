@@ -1,4 +1,6 @@
-"""Bridges inside `jax.shard_map` as it is by default, which wants loops typed by what varies over devices."""
+"""Bridges inside `jax.shard_map` as it is by default, which wants loops typed by what varies over
+devices.
+"""
 
 import os
 import subprocess

@@ -42,7 +42,9 @@ def test_fourier_functions():
     np.testing.assert_allclose(jax.jit(FourierBasis(3, 2).basis)(s), basis, atol=1e-14)
 
 
-@pytest.mark.parametrize("num_modes, num_quadrature", [(1, None), (40, None), (4, 9), (4, 10), (7, 64)])
+@pytest.mark.parametrize(
+    "num_modes, num_quadrature", [(1, None), (40, None), (4, 9), (4, 10), (7, 64)]
+)
 def test_fourier_basis_is_orthonormal(num_modes, num_quadrature):
     space = FourierBasis(num_modes, 2, num_quadrature=num_quadrature)
     phi = space.to_points(jnp.eye(space.size)[:, :2])
@@ -56,7 +58,9 @@ def test_fourier_basis_is_orthonormal(num_modes, num_quadrature):
 def test_from_points_keeps_trailing_axes():
     space = FourierBasis(3, 2)
     fields = np.random.default_rng(0).normal(size=(space.num_quadrature, 5, 2))
-    expected = np.einsum("qn,qkd->nkd", np.asarray(space.basis(space.grid)), fields) / space.num_quadrature
+    expected = (
+        np.einsum("qn,qkd->nkd", np.asarray(space.basis(space.grid)), fields) / space.num_quadrature
+    )
     np.testing.assert_allclose(space.from_points(fields), expected, atol=1e-14)
 
 
@@ -64,7 +68,9 @@ def test_quadratic_fields_have_exact_coefficients():
     space, fine = FourierBasis(12, 2), FourierBasis(12, 2, num_quadrature=200)
     x = states(space)[0]
     np.testing.assert_allclose(
-        space.from_points(space.to_points(x) ** 2), fine.from_points(fine.to_points(x) ** 2), atol=1e-12
+        space.from_points(space.to_points(x) ** 2),
+        fine.from_points(fine.to_points(x) ** 2),
+        atol=1e-12,
     )
 
 
@@ -87,7 +93,9 @@ def test_inner_product_of_landmarks(weights, expected):
     by_hand = sum(expected[i] * np.dot(x[i], y[i]) for i in range(4))
     np.testing.assert_allclose(space.inner(x, y), by_hand, rtol=1e-14)
     np.testing.assert_allclose(space.norm(x) ** 2, space.squared_norm(x), rtol=1e-14)
-    np.testing.assert_allclose(jax.grad(space.squared_norm)(x), 2 * expected[:, None] * x, rtol=1e-14)
+    np.testing.assert_allclose(
+        jax.grad(space.squared_norm)(x), 2 * expected[:, None] * x, rtol=1e-14
+    )
 
 
 def test_norm_is_the_same_in_every_space():
@@ -161,7 +169,14 @@ def test_precision_follows_the_state(space):
     def everything(x):
         values, fields = space.evaluate(x, s), space.to_points(x)
         fine = space.refine(x, FourierBasis(5, space.dim))
-        return space.from_points(fields), space.project(values, s), values, fields, fine, space.norm(x)
+        return (
+            space.from_points(fields),
+            space.project(values, s),
+            values,
+            fields,
+            fine,
+            space.norm(x),
+        )
 
     results = everything(x)
     assert [r.dtype for r in results] == [jnp.float32] * 6
@@ -207,7 +222,9 @@ def test_use_refuses():
             f(jnp.ones((1, 2)))
     with pytest.raises(ValueError, match=r"at least 4 points of dimension 2.*got shape \(3, 2\)"):
         space.project(jnp.ones((3, 2)))
-    with pytest.raises(ValueError, match=r"`s` must have one parameter for each of 5 points; got shape \(4,\)"):
+    with pytest.raises(
+        ValueError, match=r"`s` must have one parameter for each of 5 points; got shape \(4,\)"
+    ):
         space.project(jnp.ones((5, 2)), np.zeros(4))
     with pytest.raises(ValueError, match=r"`s` must be a vector of parameters; got shape \(\)"):
         space.evaluate(x, 0.3)
@@ -216,5 +233,7 @@ def test_use_refuses():
     with pytest.raises(ValueError, match=r"a row for each of 32 points; got shape \(7, 2\)"):
         FourierBasis(3, 2).from_points(jnp.ones((7, 2)))
     batch = jax.vmap(lambda w: Landmarks(4, 2, weights=w))(jnp.array([1.0, 2.0]))
-    with pytest.raises(ValueError, match=r"`weights` must be of shape \(4,\); got \(2, 4\).*`jax.vmap`"):
+    with pytest.raises(
+        ValueError, match=r"`weights` must be of shape \(4,\); got \(2, 4\).*`jax.vmap`"
+    ):
         batch.norm(x)

@@ -1,7 +1,8 @@
-"""An object is what it is wherever it is built: eagerly, under `jit` or `vmap`, in a NumPyro model, to 1e-12.
+"""An object is what it is wherever it is built: eagerly, under `jit` or `vmap`, in a NumPyro model,
+to 1e-12.
 
-Every public class that a user builds, and every argument of it, is in the table: a new one must be added. An argument
-is a constant, or `Of` a parameter that is traced where the object is built.
+Every public class that a user builds, and every argument of it, is in the table: a new one must be
+added. An argument is a constant, or `Of` a parameter that is traced where the object is built.
 """
 
 import importlib
@@ -121,7 +122,9 @@ def among(space):
     """Of a space: that of a flow, of a match, and of a curve."""
     x = start(space)
     flow = nb.KunitaFlow(space, KERNEL, noise=nb.GridNoise(-9.0, 9.0, 9))
-    condition = nb.InexactMatch(0.05, space=space).at(space.from_points(space.evaluate(2 * x, space.grid)))
+    condition = nb.InexactMatch(0.05, space=space).at(
+        space.from_points(space.evaluate(2 * x, space.grid))
+    )
     return factor_of(flow, x) + weight(nb.LinearSDE(-0.3, 0.4), condition, x)
 
 
@@ -137,8 +140,15 @@ def network(t, x, v, theta):
     return theta[0] * jnp.cos(x + t) - 0.4 * v
 
 
-STANDARD = Standard(*(jnp.asarray(a) for a in (0.9, 0.8, 0.1, 0.7, np.array([0.2]), np.array([0.5]))))
-LEARNED = {"guide": nb.Unguided(), "network": network, "standard": STANDARD, "context": lambda sde: jnp.ones(1)}
+STANDARD = Standard(
+    *(jnp.asarray(a) for a in (0.9, 0.8, 0.1, 0.7, np.array([0.2]), np.array([0.5])))
+)
+LEARNED = {
+    "guide": nb.Unguided(),
+    "network": network,
+    "standard": STANDARD,
+    "context": lambda sde: jnp.ones(1),
+}
 MEET = {"sde": PLAIN, "condition": ACTUAL, "x0": X0}
 LAW = {"sde": PLAIN, "x0": X0, "match": nb.InexactMatch(0.05), "ts": TS}
 BATCH = np.stack([X0, X0 + 0.1])
@@ -381,7 +391,9 @@ def test_the_table_is_complete():
     for cls, arguments, _ in TABLE.values():
         given.setdefault(cls, set()).update(arguments)
     for cls in set(public_classes()):
-        assert (cls in given) != (cls.__name__ in LEFT_OUT), f"{cls.__name__} needs a row of the table"
+        assert (cls in given) != (cls.__name__ in LEFT_OUT), (
+            f"{cls.__name__} needs a row of the table"
+        )
         if cls in given:
             missing = set(inspect.signature(cls).parameters) - given[cls] - ARGUMENTS_LEFT_OUT
             assert not missing, f"no row of {cls.__name__} gives {sorted(missing)}"
@@ -427,7 +439,9 @@ def log_likelihood(name, t):
 
 @pytest.mark.parametrize("name", TABLE)
 def test_built_anywhere(name):
-    """One program: of the object built outside, and of those built inside from the traced parameter."""
+    """One program: of the object built outside, and of those built inside from the traced
+    parameter.
+    """
     parameters = np.array([1.3, 0.8])
     thing = made(name, parameters[0])
 
@@ -440,5 +454,10 @@ def test_built_anywhere(name):
     eager, one, modelled, mapped = values(parameters)
     _, other, _, exchanged = values(parameters[::-1])
     assert np.isfinite(eager)
-    for found, truth in ((one, eager), (modelled, eager), (mapped, [eager, other]), (exchanged, [other, eager])):
+    for found, truth in (
+        (one, eager),
+        (modelled, eager),
+        (mapped, [eager, other]),
+        (exchanged, [other, eager]),
+    ):
         np.testing.assert_allclose(found, truth, rtol=1e-12, atol=1e-12)

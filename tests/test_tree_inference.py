@@ -1,7 +1,8 @@
-"""Inference on trees: moves by branch and clade, ancestors for ArviZ, evidence. The referee is the dense normal.
+"""Inference on trees: moves by branch and clade, ancestors for ArviZ, evidence. The referee is the
+dense normal.
 
-One law throughout, Brownian motion as a user's SDE, led by a guide of another covariance, so that its weight depends on
-the noise.
+One law throughout, Brownian motion as a user's SDE, led by a guide of another covariance, so that
+its weight depends on the noise.
 """
 
 import warnings
@@ -25,7 +26,9 @@ with warnings.catch_warnings():
 
 pytestmark = [pytest.mark.numpyro, pytest.mark.usefixtures("compile_quickly")]
 
-TREE = nb.Tree.from_newick("((a:1,b:1.5)x:.5,(c:3,d:.5):0.1,u:1)r:.3;").observing(["a", "b", "c", "d", "x"])
+TREE = nb.Tree.from_newick("((a:1,b:1.5)x:.5,(c:3,d:.5):0.1,u:1)r:.3;").observing(
+    ["a", "b", "c", "d", "x"]
+)
 RATE, VARIANCE, STEPS = 0.4, 0.3, 2
 DATA = np.random.default_rng(0).normal(size=(len(TREE.observed), 1))
 LAW = nb.DiffusionTree(
@@ -52,7 +55,11 @@ def posterior():
     C, seen = covariance(), list(TREE.observed)
     total = C[np.ix_(seen, seen)] + VARIANCE * np.eye(len(seen))
     gain = np.linalg.solve(total, C[seen]).T
-    return gain @ DATA[:, 0], C - gain @ C[seen], stats.multivariate_normal(None, total).logpdf(DATA[:, 0])
+    return (
+        gain @ DATA[:, 0],
+        C - gain @ C[seen],
+        stats.multivariate_normal(None, total).logpdf(DATA[:, 0]),
+    )
 
 
 def model(data=None):
@@ -60,9 +67,13 @@ def model(data=None):
 
 
 def test_terms_of_branches(key):
-    """They add up to the log probability, and know the noise of their own branch and of those before it alone."""
+    """They add up to the log probability, and know the noise of their own branch and of those
+    before it alone.
+    """
     z = jr.normal(key, LAW.noise_prior().shape())
-    terms, slopes = jax.jit(lambda z: (LAW.given(z)._log_prob_by_block(DATA), jax.jacfwd(by_block)(z)))(z)
+    terms, slopes = jax.jit(
+        lambda z: (LAW.given(z)._log_prob_by_block(DATA), jax.jacfwd(by_block)(z))
+    )(z)
     np.testing.assert_allclose(jnp.sum(terms), LAW.given(z).log_prob(DATA), rtol=1e-12)
     depends = np.abs(slopes).reshape(len(terms), len(terms), -1).max(-1) > 1e-12
     above = [[other in TREE._lineage(node) for other in BRANCHES] for node in BRANCHES]
@@ -76,7 +87,12 @@ def by_block(z):
 
 def chains(kernel):
     """Four of them, with one move for each of three levels in every draw."""
-    settings = {"num_warmup": 300, "num_samples": 2000, "num_chains": 4, "chain_method": "vectorized"}
+    settings = {
+        "num_warmup": 300,
+        "num_samples": 2000,
+        "num_chains": 4,
+        "chain_method": "vectorized",
+    }
     mcmc = MCMC(kernel, progress_bar=False, **settings)
     mcmc.run(jr.key(0), DATA)
     return mcmc
@@ -106,10 +122,17 @@ def test_moves_by_clade():
 def test_moves_by_branch(run):
     mcmc, data = run
     nodes = data["posterior_nodes"]["tips"]
-    assert nodes.dims == ("chain", "draw", "node", "coordinate") and nodes.shape == (4, 2000, len(BRANCHES), 1)
+    assert nodes.dims == ("chain", "draw", "node", "coordinate") and nodes.shape == (
+        4,
+        2000,
+        len(BRANCHES),
+        1,
+    )
     names = [TREE.names[node] or f"node {node}" for node in BRANCHES]
     assert list(nodes["node"]) == names and names[INNER[-1] - 1] == "node 5"
-    check_ancestors(nodes.sel(node=[names[node - 1] for node in INNER]).values.reshape(-1, len(INNER)))
+    check_ancestors(
+        nodes.sel(node=[names[node - 1] for node in INNER]).values.reshape(-1, len(INNER))
+    )
     angles = mcmc.last_state.angles[0]
     assert angles.shape == (4, len(BRANCHES)) and np.all(angles > 0.1)
 
@@ -117,19 +140,27 @@ def test_moves_by_branch(run):
 def test_diagnostics_of_ancestors(run):
     table = arviz.summary(run[1], group="posterior_nodes")
     assert len(table) == len(BRANCHES) and "tips[node 5, 0]" in table.index
-    assert np.all(table["r_hat"].astype(float) < 1.05) and np.all(table["ess_bulk"].astype(float) > 200)
+    assert np.all(table["r_hat"].astype(float) < 1.05) and np.all(
+        table["ess_bulk"].astype(float) > 200
+    )
 
 
 def test_leaving_out_one_node(run):
-    """The harmonic mean of each node's term, against the dense normal of one datum given the others."""
+    """The harmonic mean of each node's term, against the dense normal of one datum given the
+    others.
+    """
     values = run[1].log_likelihood["tips"]
-    assert values.dims == ("chain", "draw", "node") and list(values["node"]) == list(TREE.observed_names)
+    assert values.dims == ("chain", "draw", "node") and list(values["node"]) == list(
+        TREE.observed_names
+    )
     found = -np.log(np.mean(np.exp(-values), axis=(0, 1)))
     seen = list(TREE.observed)
     total = covariance()[np.ix_(seen, seen)] + VARIANCE * np.eye(len(seen))
     precision = np.linalg.inv(total)
     variance = 1 / np.diag(precision)
-    truth = stats.norm(DATA[:, 0] - variance * (precision @ DATA[:, 0]), np.sqrt(variance)).logpdf(DATA[:, 0])
+    truth = stats.norm(DATA[:, 0] - variance * (precision @ DATA[:, 0]), np.sqrt(variance)).logpdf(
+        DATA[:, 0]
+    )
     np.testing.assert_allclose(found, truth, atol=0.1)
     assert np.std(truth) > 0.2 and np.all(np.std(values, axis=(0, 1)) > 0.05)
 
@@ -140,11 +171,15 @@ def test_paths_along_branches(run):
     assert paths.dims == ("chain", "draw", "branch", "step", "coordinate")
     assert paths.shape == (4, 2, len(BRANCHES), STEPS + 1, 1)
     np.testing.assert_allclose(times.sel(branch="b")[0, 0], [0.8, 1.55, 2.3])
-    np.testing.assert_allclose(paths.isel(step=-1), data["posterior_nodes"]["tips"].sel(draw=paths["draw"]))
+    np.testing.assert_allclose(
+        paths.isel(step=-1), data["posterior_nodes"]["tips"].sel(draw=paths["draw"])
+    )
 
 
 def test_hamiltonian_moves_without_parameters():
-    """They are traced in double precision, in which an empty vector of parameters is of another type."""
+    """They are traced in double precision, in which an empty vector of parameters is of another
+    type.
+    """
     kernel = FunctionSpaceHMC(model)
 
     def two_draws(key):
@@ -161,14 +196,25 @@ SHARP = 0.01  # variance of the error, beside which the guide of another covaria
 def sharp_law():
     guide = nb.FrozenGuide(nb.BrownianMotion(20.0))
     settings = {"tree": TREE, "num_steps": STEPS, "guide": guide}
-    return nb.DiffusionTree(nb.BrownianMotion(RATE), np.zeros(1), nb.InexactMatch(SHARP), **settings)
+    return nb.DiffusionTree(
+        nb.BrownianMotion(RATE), np.zeros(1), nb.InexactMatch(SHARP), **settings
+    )
 
 
 @pytest.mark.parametrize("method", ["smc", "bridge"])
 def test_evidence(method):
-    """The dense normal within 4 standard errors, one of which is below 0.1; importance weights have an SD of 5."""
+    """The dense normal within 4 standard errors, one of which is below 0.1; importance weights have
+    an SD of 5.
+    """
     found = nb.estimate_tree_evidence(
-        sharp_law(), DATA, jr.key(1), method=method, num_particles=64, batch_size=64, num_moves=1, progress=False
+        sharp_law(),
+        DATA,
+        jr.key(1),
+        method=method,
+        num_particles=64,
+        batch_size=64,
+        num_moves=1,
+        progress=False,
     )
     seen = list(TREE.observed)
     total = covariance()[np.ix_(seen, seen)] + SHARP * np.eye(len(seen))
@@ -191,7 +237,8 @@ def nonlinear(data):
 
 
 def test_evidence_of_a_model(monkeypatch):
-    """A nonlinear tree and another datum, a parameter integrated over its prior, against simulation in NumPy.
+    """A nonlinear tree and another datum, a parameter integrated over its prior, against simulation
+    in NumPy.
 
     By more temperatures than are needed, so that moves of the parameter matter.
     """
@@ -202,13 +249,19 @@ def test_evidence_of_a_model(monkeypatch):
     for node in range(1, THREE.num_nodes):
         x, dt = states[THREE.parents[node]], float(THREE.lengths[node - 1]) / STEPS
         for _ in range(STEPS):
-            x = x + dt * strength * np.sin(x) + np.sqrt(dt) * (0.6 + 0.1 * np.cos(x)) * rng.normal(size=count)
+            x = (
+                x
+                + dt * strength * np.sin(x)
+                + np.sqrt(dt) * (0.6 + 0.1 * np.cos(x)) * rng.normal(size=count)
+            )
         states[node] = x
     for node, v in zip(THREE.observed, SEEN[:, 0], strict=True):
         log_density = log_density + stats.norm(states[node], np.sqrt(0.05)).logpdf(v)
     w = np.exp(log_density)
     truth, error = np.log(w.mean()), w.std() / np.sqrt(count) / w.mean()
-    found = nb.estimate_model_evidence(nonlinear, jr.key(2), SEEN, batch_size=64, num_moves=1, progress=False)
+    found = nb.estimate_model_evidence(
+        nonlinear, jr.key(2), SEEN, batch_size=64, num_moves=1, progress=False
+    )
     print(found, truth, error)
     assert error < 0.02 and found.standard_error < 0.05 and len(found.inverse_temperatures) > 3
     assert abs(found.log_evidence - truth) < 4 * np.hypot(found.standard_error, error)
@@ -225,7 +278,10 @@ def improper(data):
 
 
 REFUSED = {
-    "noise": (lambda data: numpyro.sample("x", dist.Normal(), obs=0.0), "`model` must have driving noise"),
+    "noise": (
+        lambda data: numpyro.sample("x", dist.Normal(), obs=0.0),
+        "`model` must have driving noise",
+    ),
     "prior": (improper, r"`model` must have proper priors, .* \['level'\] are improper"),
     "scale": (scaled, "is scaled, by `handlers.scale` or a plate that is subsampled"),
 }
@@ -241,9 +297,17 @@ def test_models_without_an_evidence(name):
 def test_failures_are_no_numbers():
     """NaN in a weight makes the estimate NaN, and says so."""
     estimates = jnp.array([1.0, jnp.nan, 2.0])
-    found = nb.TemperedEvidence(jnp.nan, jnp.nan, estimates, np.array([0.0, 1.0]), np.array([0.9]), 4, "smc")
+    found = nb.TemperedEvidence(
+        jnp.nan, jnp.nan, estimates, np.array([0.0, 1.0]), np.array([0.9]), 4, "smc"
+    )
     assert not found.trusted and "nan" in str(found)
     apart = nb.TemperedEvidence(
-        jnp.array(1.0), jnp.array(0.5), jnp.array([-3.0, 1.0, 3.0]), np.array([0.0, 1.0]), np.array([0.9]), 4, "smc"
+        jnp.array(1.0),
+        jnp.array(0.5),
+        jnp.array([-3.0, 1.0, 3.0]),
+        np.array([0.0, 1.0]),
+        np.array([0.9]),
+        4,
+        "smc",
     )
     assert "islands differ by 3.1 nats" in str(apart)

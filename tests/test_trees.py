@@ -1,4 +1,6 @@
-"""Trees: what is read and what is refused; times, clades and pruning against walks over dictionaries."""
+"""Trees: what is read and what is refused; times, clades and pruning against walks over
+dictionaries.
+"""
 
 import io as text_io
 from types import SimpleNamespace
@@ -26,8 +28,16 @@ def depth_of(tree, name):
 READ = {
     "plain": (ABC, ["a", "b", "c"], [3.0, 3.5, 3.0]),
     "unifurcation": ("((a:1,b:1):1,(c:1):1);", ["a", "b", "c"], [2.0, 2.0, 2.0]),
-    "quotes": ("('H. sapiens (1)':1,'Fred''s [sp.]':2);", ["H. sapiens (1)", "Fred's [sp.]"], [1.0, 2.0]),
-    "underscores": ("(Mus_musculus:1,Homo_sapiens:1);", ["Mus_musculus", "Homo_sapiens"], [1.0, 1.0]),
+    "quotes": (
+        "('H. sapiens (1)':1,'Fred''s [sp.]':2);",
+        ["H. sapiens (1)", "Fred's [sp.]"],
+        [1.0, 2.0],
+    ),
+    "underscores": (
+        "(Mus_musculus:1,Homo_sapiens:1);",
+        ["Mus_musculus", "Homo_sapiens"],
+        [1.0, 1.0],
+    ),
     "annotations": (
         "[&R] ((a[&rate=0.1]:1,b:1.0E-2)[&h={0.1,0.2}]:1,[x]'c d':2):0.5;",
         ["a", "b", "c d"],
@@ -39,9 +49,14 @@ READ = {
     "lines": ("((a:1,\n b:1):1,c:2)\n;\n", ["a", "b", "c"], [2.0, 2.0, 2.0]),
     "no semicolon": ("((a:1,b:1):1,c:2)", ["a", "b", "c"], [2.0, 2.0, 2.0]),
     "one branch": ("a:1;", ["a"], [1.0]),
-    "polytomy": ("(a:1,b:2,(c:1,d:1,e:1):1);", ["a", "b", "c", "d", "e"], [1.0, 2.0, 2.0, 2.0, 2.0]),
+    "polytomy": (
+        "(a:1,b:2,(c:1,d:1,e:1):1);",
+        ["a", "b", "c", "d", "e"],
+        [1.0, 2.0, 2.0, 2.0, 2.0],
+    ),
     "nexus": (
-        "#NEXUS\nBEGIN TREES;\nTRANSLATE 1 'A. x', 2 b, 3 c;\nTREE t = [&R] ((1:1,2:1):1,3:2);\nEND;",
+        "#NEXUS\nBEGIN TREES;\nTRANSLATE 1 'A. x', 2 b, 3 c;\nTREE t = [&R] "
+        "((1:1,2:1):1,3:2);\nEND;",
         ["A. x", "b", "c"],
         [2.0, 2.0, 2.0],
     ),
@@ -87,7 +102,10 @@ REFUSED = {
     "two lengths": ("((a:1,b:1),\nc:2:1);", "two lengths, line 2, column 4"),
     "a parenthesis": ("((a:1,b:1:1);", "two lengths|Newick"),
     "not closed": ("((a:1,b:1);", "`source` must be Newick or NEXUS"),
-    "several": ("(a:1,b:1);(c:1,d:1);", "holds 2 trees where one is asked for: choose one by `index`"),
+    "several": (
+        "(a:1,b:1);(c:1,d:1);",
+        "holds 2 trees where one is asked for: choose one by `index`",
+    ),
     "empty": (";", "`source` must|at least two nodes"),
 }
 
@@ -116,7 +134,11 @@ def random_tree(rng, count):
     parents = np.full(count, -1)
     for i in range(1, count):
         parents[order[i]] = order[rng.integers(max(0, i - 4), i)]
-    return parents, np.where(rng.random(count) < 0.2, 0.0, rng.exponential(size=count)), [f"n{i}" for i in range(count)]
+    return (
+        parents,
+        np.where(rng.random(count) < 0.2, 0.0, rng.exponential(size=count)),
+        [f"n{i}" for i in range(count)],
+    )
 
 
 @pytest.mark.parametrize("count", [2, 3, 40, 300])
@@ -149,7 +171,9 @@ def test_times_clades_and_pruning(count):
 
     small = tree.pruned(some)
     assert [small.names[i] for i in small.tips] == [name for name in tips if name in some]
-    np.testing.assert_allclose([depth_of(small, name) for name in some], [depth[name] for name in some], atol=1e-12)
+    np.testing.assert_allclose(
+        [depth_of(small, name) for name in some], [depth[name] for name in some], atol=1e-12
+    )
     splits = [sum(parent == i for parent in small.parents) for i in range(1, small.num_nodes)]
     assert 1 not in splits
 
@@ -165,7 +189,9 @@ def test_as_dendropy_has_it():
         return (f"({','.join(below)})" if below else "") + f"{names[i]}:{float(lengths[i])!r}"
 
     text = newick(int(np.flatnonzero(parents == -1)[0])) + ";"
-    theirs = dendropy.Tree.get(file=text_io.StringIO(text), schema="newick").phylogenetic_distance_matrix()
+    theirs = dendropy.Tree.get(
+        file=text_io.StringIO(text), schema="newick"
+    ).phylogenetic_distance_matrix()
     taxa = {taxon.label: taxon for taxon in theirs.taxon_iter()}
     read = nb.Tree.from_newick(text)
     for ours in (tree, read):
@@ -197,9 +223,13 @@ def test_lengths_are_parameters():
         return tree.scaled(jnp.where(fast, rate, 1.0)).depths
 
     np.testing.assert_allclose(depths(tree, 2.0), [0.0, 4.0, 6.0, 7.0, 3.0])
-    np.testing.assert_allclose(depths(tree.with_lengths([1.0, 1.0, 1.0, 5.0]), 3.0), [0.0, 3.0, 6.0, 6.0, 5.0])
+    np.testing.assert_allclose(
+        depths(tree.with_lengths([1.0, 1.0, 1.0, 5.0]), 3.0), [0.0, 3.0, 6.0, 6.0, 5.0]
+    )
     assert len(traced) == 1
-    slope = jax.grad(lambda lengths: tree.with_lengths(lengths).pruned(["a", "c"]).depths[1])(tree.lengths)
+    slope = jax.grad(lambda lengths: tree.with_lengths(lengths).pruned(["a", "c"]).depths[1])(
+        tree.lengths
+    )
     np.testing.assert_allclose(slope, [1.0, 1.0, 0.0, 0.0])
     stack = jax.vmap(lambda scale: tree.scaled(scale))(np.array([1.0, 2.0]))
     np.testing.assert_allclose(stack.lengths, np.outer([1.0, 2.0], tree.lengths))
@@ -237,8 +267,14 @@ def test_several_rows_of_a_node():
     """By name, in the order given; nodes in preorder."""
     names, values = ["c", "a", "c", "b", "c"], np.array([1.0, 2.0, 3.0, 4.0, 5.0])
     tree = nb.Tree.from_newick(ABC).observing(names)
-    assert tree.observed_names == ("a", "b", "c", "c", "c") and tree.scaled(2.0).observed == tree.observed
-    specimens = [io.Specimen(np.full((1, 2), value), id=name) for name, value in zip(names, values, strict=True)]
+    assert (
+        tree.observed_names == ("a", "b", "c", "c", "c")
+        and tree.scaled(2.0).observed == tree.observed
+    )
+    specimens = [
+        io.Specimen(np.full((1, 2), value), id=name)
+        for name, value in zip(names, values, strict=True)
+    ]
     for rows in (
         tree.rows(values, names=names),
         tree.rows({"b": 4.0, "c": [1.0, 3.0, 5.0], "a": 2.0}),
@@ -260,9 +296,18 @@ ROWS = {
         {"A. marvortium": 1.0, "A. tigrinum": 1.0},
         r"Perhaps 'A\. marvortium' for 'A\. mavortium'\?",
     ),
-    "blanks": ({"Mus musculus": 1.0}, "Perhaps 'Mus musculus' for 'Mus_musculus'.*preserve_underscores=False"),
-    "fewer": ({"a": 1.0}, r"Without data: b, c\. Tips without data are left out by `tree.observing\(data\)`"),
-    "another shape": (without(b=[[1.0, 2.0], [3.0, 4.0]]), r"one shape; 'a' has \(1, 2\) and 'b' has \(2, 2\)"),
+    "blanks": (
+        {"Mus musculus": 1.0},
+        "Perhaps 'Mus musculus' for 'Mus_musculus'.*preserve_underscores=False",
+    ),
+    "fewer": (
+        {"a": 1.0},
+        r"Without data: b, c\. Tips without data are left out by `tree.observing\(data\)`",
+    ),
+    "another shape": (
+        without(b=[[1.0, 2.0], [3.0, 4.0]]),
+        r"one shape; 'a' has \(1, 2\) and 'b' has \(2, 2\)",
+    ),
     "text": (without(b="x"), r"`data\['b'\]` must be a number"),
     "no specimens": ([1.0, 2.0, 3.0], r"`data\[0\]` must be a `Specimen`; an array needs `names=`"),
 }
@@ -271,7 +316,10 @@ ROWS = {
 @pytest.mark.parametrize("name", ROWS)
 def test_rows_that_do_not_fit(name):
     data, message = ROWS[name]
-    text = {"a spelling": "('A. mavortium':1,'A. tigrinum':1);", "blanks": "(Mus_musculus:1,a:1);"}.get(name, ABC)
+    text = {
+        "a spelling": "('A. mavortium':1,'A. tigrinum':1);",
+        "blanks": "(Mus_musculus:1,a:1);",
+    }.get(name, ABC)
     with pytest.raises(ValueError, match=message):
         nb.Tree.from_newick(text).rows(data)
 
@@ -280,32 +328,60 @@ def test_rows_of_an_array():
     tree = nb.Tree.from_newick(ABC)
     with pytest.raises(ValueError, match="`names` must be one for each row of `data`, 3; got 2"):
         tree.rows(np.ones((3, 2)), names=["a", "b"])
-    with pytest.raises(ValueError, match="have 2 rows of 'a', which the tree sees 1 times. `tree.observing"):
+    with pytest.raises(
+        ValueError, match="have 2 rows of 'a', which the tree sees 1 times. `tree.observing"
+    ):
         tree.rows(np.ones((4, 2)), names=["a", "a", "b", "c"])
     with pytest.raises(ValueError, match=r"Without data: c\. Without a node: A"):
         tree.observing(["c", "a", "a"]).rows(np.ones((3, 2)), names=["a", "A", "a"])
     with pytest.raises(ValueError, match=r"`data\['a'\]` must have an axis of rows in front"):
         tree.observing(["a", "a"]).rows({"a": 1.0})
-    with pytest.raises(ValueError, match="the seen nodes must have names.*node 1, which leads to 1 has none"):
+    with pytest.raises(
+        ValueError, match="the seen nodes must have names.*node 1, which leads to 1 has none"
+    ):
         nb.Tree.star([1.0, 2.0]).rows({"a": 1.0})
 
 
 WRONG = {
     "no root": (lambda: nb.Tree.from_parents([1, 0], [1.0, 1.0]), "one root, of parent −1; got 0"),
-    "two roots": (lambda: nb.Tree.from_parents([-1, -1], [1.0, 1.0]), "one root, of parent −1; got 2"),
-    "a circle": (lambda: nb.Tree.from_parents([-1, 2, 1], np.ones(3)), r"nodes \[1, 2\] run in a circle"),
-    "a number": (lambda: nb.Tree.from_parents([-1, 5], np.ones(2)), r"numbers of nodes, from 0 to 1.*got \[5"),
+    "two roots": (
+        lambda: nb.Tree.from_parents([-1, -1], [1.0, 1.0]),
+        "one root, of parent −1; got 2",
+    ),
+    "a circle": (
+        lambda: nb.Tree.from_parents([-1, 2, 1], np.ones(3)),
+        r"nodes \[1, 2\] run in a circle",
+    ),
+    "a number": (
+        lambda: nb.Tree.from_parents([-1, 5], np.ones(2)),
+        r"numbers of nodes, from 0 to 1.*got \[5",
+    ),
     "order": (lambda: nb.Tree([1, -1], [1.0]), "`parents` must be in preorder"),
     "blocks": (lambda: nb.Tree([-1, 0, 0, 1], np.ones(3)), "`parents` must be in preorder"),
-    "lengths": (lambda: nb.Tree([-1, 0, 0], [1.0]), r"`lengths` must be one for each branch, \(2,\).*got shape \(1,\)"),
+    "lengths": (
+        lambda: nb.Tree([-1, 0, 0], [1.0]),
+        r"`lengths` must be one for each branch, \(2,\).*got shape \(1,\)",
+    ),
     "NaN": (lambda: nb.Tree.star([1.0, np.nan], ["a", "b"]), "above `b` has nan"),
     "names": (lambda: nb.Tree.star([1.0, 1.0], ["a"]), "`names` must be one for each of 2 nodes"),
     "no text": (lambda: nb.Tree.star([1.0], [3]), "`names` must be texts, or None; got 3"),
     "times": (lambda: nb.Tree.chain([1.0, 0.5]), "`times` must not decrease"),
-    "early": (lambda: nb.Tree.chain([-1.0, 0.5]), "`times` must not decrease, from 0 at the root on"),
-    "rates": (lambda: nb.Tree.star([1.0]).scaled([1.0, 2.0]), r"`rates` must be one number, or one for each branch"),
-    "observed": (lambda: nb.Tree([-1, 0], [1.0], None, [2]), "`observed` must be numbers of nodes, from 0 to 1"),
-    "nobody": (lambda: nb.Tree.from_newick(ABC).observing(["aa"]), r"it has no 'aa'\. Near it: 'a'"),
+    "early": (
+        lambda: nb.Tree.chain([-1.0, 0.5]),
+        "`times` must not decrease, from 0 at the root on",
+    ),
+    "rates": (
+        lambda: nb.Tree.star([1.0]).scaled([1.0, 2.0]),
+        r"`rates` must be one number, or one for each branch",
+    ),
+    "observed": (
+        lambda: nb.Tree([-1, 0], [1.0], None, [2]),
+        "`observed` must be numbers of nodes, from 0 to 1",
+    ),
+    "nobody": (
+        lambda: nb.Tree.from_newick(ABC).observing(["aa"]),
+        r"it has no 'aa'\. Near it: 'a'",
+    ),
     "no tip": (lambda: nb.Tree.from_newick("((a:1,b:1)x:1,c:1);").pruned(["x"]), "`x` is no tip"),
 }
 
@@ -317,7 +393,11 @@ def test_wrong_trees(name):
         make()
 
 
-TREES = {"papilio": (5, None), "morpho": (30, "forewing_means_20.csv"), "tyrannus": (13, "species_means.csv")}
+TREES = {
+    "papilio": (5, None),
+    "morpho": (30, "forewing_means_20.csv"),
+    "tyrannus": (13, "species_means.csv"),
+}
 
 
 @pytest.mark.parametrize("folder", TREES)
@@ -327,12 +407,16 @@ def test_published_trees(folder, shared_data):
     tree = nb.Tree.from_newick(shared_data / folder / "tree.nwk")
     assert len(tree.tips) == count
     if table:  # these two are dated
-        np.testing.assert_allclose(np.asarray(tree.ages)[list(tree.tips)], 0.0, atol=1e-3 * float(tree.height))
+        np.testing.assert_allclose(
+            np.asarray(tree.ages)[list(tree.tips)], 0.0, atol=1e-3 * float(tree.height)
+        )
         lines = (shared_data / folder / table).read_text().splitlines()
         names = {line.split(",")[0]: float(line.split(",")[2]) for line in lines[1:]}
         assert tree.rows(names).shape == (count,)
 
 
 def test_anything_with_landmarks_and_an_id_is_a_specimen():
-    named = [SimpleNamespace(id=name, landmarks=np.asarray(shape)) for name, shape in SHAPES.items()]
+    named = [
+        SimpleNamespace(id=name, landmarks=np.asarray(shape)) for name, shape in SHAPES.items()
+    ]
     assert nb.Tree.from_newick(ABC).rows(named).shape == (3, 1, 2)

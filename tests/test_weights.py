@@ -18,7 +18,9 @@ STATISTICS = [weights.effective_sample_size, weights.standard_error, weights.par
 
 
 def extended(log_weights):
-    """Log mean, ESS, and standard error in extended precision: of the weights drawn, and of those missed."""
+    """Log mean, ESS, and standard error in extended precision: of the weights drawn, and of those
+    missed.
+    """
     log_weights = np.asarray(log_weights, np.longdouble)
     w = np.exp(log_weights - log_weights.max())
     log_mean = log_weights.max() + np.log(w.mean())
@@ -34,7 +36,9 @@ def missing(w):
     y = y[y > 0]
     n = y.size
     m = 30 + math.isqrt(length)
-    b = 1 / y[-1] + (1 - np.sqrt(m / (np.arange(m) + np.longdouble(0.5)))) / (3 * y[(n + 2) // 4 - 1])
+    b = 1 / y[-1] + (1 - np.sqrt(m / (np.arange(m) + np.longdouble(0.5)))) / (
+        3 * y[(n + 2) // 4 - 1]
+    )
     k = np.mean(np.log1p(-b[:, None] * y), axis=1)
     log_likelihood = n * (np.log(np.abs(b / k)) - k - 1)
     b = np.average(b, weights=np.exp(log_likelihood - log_likelihood.max()))
@@ -68,7 +72,9 @@ def test_extended_precision(key, shift, scale):
     np.testing.assert_allclose(weights.effective_sample_size(log_weights), float(ess), rtol=1e-11)
     np.testing.assert_allclose(weights.standard_error(log_weights), float(error), rtol=1e-8)
     together = weights.quality(log_weights)
-    for statistic, value in zip(["standard_error", "effective_sample_size", "pareto_k"], together, strict=True):
+    for statistic, value in zip(
+        ["standard_error", "effective_sample_size", "pareto_k"], together, strict=True
+    ):
         np.testing.assert_allclose(value, getattr(weights, statistic)(log_weights), rtol=1e-12)
 
 
@@ -82,10 +88,13 @@ def test_equal_weights(shift):
 
 
 def test_standard_error_is_the_spread_of_the_estimate():
-    log_weights = jnp.log(jr.uniform(jr.key(1), (4000, 500), minval=0.01))  # no tail, of which to miss something
+    # no tail, of which to miss something
+    log_weights = jnp.log(jr.uniform(jr.key(1), (4000, 500), minval=0.01))
     estimates = weights.log_mean_exp(log_weights)
     # the standard deviation of 4000 estimates has a relative error of 1.1 %
-    np.testing.assert_allclose(weights.standard_error(log_weights).mean(), estimates.std(), rtol=0.045)
+    np.testing.assert_allclose(
+        weights.standard_error(log_weights).mean(), estimates.std(), rtol=0.045
+    )
 
 
 # where the two lines round the length of the tail alike
@@ -94,7 +103,9 @@ def test_standard_error_is_the_spread_of_the_estimate():
 @pytest.mark.parametrize("shift", SHIFTS)
 def test_pareto_k_is_arviz(key, num_particles, scale, shift):
     log_weights = shift + scale * jr.normal(key, (num_particles,))
-    np.testing.assert_allclose(weights.pareto_k(log_weights), arviz_k(log_weights), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(
+        weights.pareto_k(log_weights), arviz_k(log_weights), rtol=1e-8, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("k", [0.2, 0.5, 0.9])
@@ -102,11 +113,13 @@ def test_pareto_k_of_pareto_samples(k):
     # w = u^-k has an exactly generalised Pareto tail of shape k above every cutoff.
     num_particles, num_tail, replicates = 10_000, 300, 64
     found = weights.pareto_k(k * jr.exponential(jr.key(2), (replicates, num_particles)))
-    error = (1 + k) / math.sqrt(num_tail * replicates)  # asymptotic, of the maximum likelihood estimate
+    # asymptotic, of the maximum likelihood estimate
+    error = (1 + k) / math.sqrt(num_tail * replicates)
     assert error < 0.014
     shrunk = (num_tail * k + 5) / (num_tail + 10)
     assert abs(found.mean() - shrunk) < 4 * error
-    np.testing.assert_allclose(found.std(), (1 + k) / math.sqrt(num_tail), rtol=0.35)  # 4 errors of 9 %
+    # 4 errors of 9 %
+    np.testing.assert_allclose(found.std(), (1 + k) / math.sqrt(num_tail), rtol=0.35)
 
 
 def test_pareto_k_of_degenerate_weights(key):
@@ -164,7 +177,9 @@ def test_single_precision_stays_single(key):
     for statistic in [weights.log_mean_exp, *STATISTICS]:
         value = statistic(log_weights)
         assert value.dtype == jnp.float32
-        np.testing.assert_allclose(value, statistic(log_weights.astype(jnp.float64)), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(
+            value, statistic(log_weights.astype(jnp.float64)), rtol=1e-4, atol=1e-4
+        )
 
 
 @pytest.mark.parametrize("statistic", [weights.log_mean_exp, weights.quality, *STATISTICS])

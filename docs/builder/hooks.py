@@ -112,7 +112,7 @@ def _image_if_there(found: re.Match) -> str:
 
 
 def reference_pages() -> Iterator[tuple[str, str]]:
-    """A page for each sub-package, one on what only the top level has, and a first that lists it."""
+    """A page for each sub-package, one on what only the top level has, a first that lists it."""
     top = {name: value for name, value in vars(nb).items() if ours(name, value)}
     names = [info.name for info in pkgutil.iter_modules(nb.__path__)]
     units = [name for name in names if not name.startswith("_")]

@@ -17,7 +17,11 @@ from ._density import (
     AbstractDensityMatch as AbstractDensityMatch,
     DensityMatch as DensityMatch,
 )
-from ._distance import HuberMatch as HuberMatch, ProcrustesMatch as ProcrustesMatch, StudentMatch as StudentMatch
+from ._distance import (
+    HuberMatch as HuberMatch,
+    ProcrustesMatch as ProcrustesMatch,
+    StudentMatch as StudentMatch,
+)
 from ._fused import fused as fused
 from ._match import ExactMatch as ExactMatch, InexactMatch as InexactMatch
 from ._message import (

@@ -1,8 +1,9 @@
 """What is seen of the end state.
 
-A *match* is a model of observation; `match.at(v)` is a *condition*, the match at its datum. A bridge asks a condition
-for three things: the linear observation that it makes of the end state, a value near which to linearise, and the
-value that a path is led to, which is the datum itself or, for a set, a draw inside it.
+A *match* is a model of observation; `match.at(v)` is a *condition*, the match at its datum. A
+bridge asks a condition for three things: the linear observation that it makes of the end state, a
+value near which to linearise, and the value that a path is led to, which is the datum itself or,
+for a set, a draw inside it.
 """
 
 import abc
@@ -20,7 +21,9 @@ from ..sdes import AbstractSDE
 
 
 class Observation(eqx.Module):
-    """v = operator x + N(0, factor factorᵀ), or v = operator x where `factor` is None; density times exp(log_scale)."""
+    """v = operator x + N(0, factor factorᵀ), or v = operator x where `factor` is None; density
+    times exp(log_scale).
+    """
 
     operator: Structured
     factor: Structured | None
@@ -52,8 +55,9 @@ class AbstractCondition(eqx.Module):
     """Rows of noise that choose the target, before the first step."""
 
     is_approximated: ClassVar[bool] = False
-    """Whether paths are led by an approximation, an observation of all columns of a state together: `anchored` finds it
-    and `correction` weighs it. It is of x.reshape(-1), where other observations are of each column alike."""
+    """Whether paths are led by an approximation, an observation of all columns of a state together:
+    `anchored` finds it and `correction` weighs it. It is of x.reshape(-1), where other observations
+    are of each column alike."""
 
     @property
     @abc.abstractmethod
@@ -74,18 +78,26 @@ class AbstractCondition(eqx.Module):
 
     @abc.abstractmethod
     def log_value(self, law_mean: State, law_factor: Structured) -> Float[Array, ""]:
-        """log h̃: the density, or the probability, of the condition under N(mean, factor factorᵀ) for what is seen."""
+        """log h̃: the density, or the probability, of the condition under N(mean, factor factorᵀ)
+        for what is seen.
+        """
 
     @abc.abstractmethod
-    def target(self, law_mean: State, law_factor: Structured, noise: Float[Array, "extra k *dim"]) -> Target:
+    def target(
+        self, law_mean: State, law_factor: Structured, noise: Float[Array, "extra k *dim"]
+    ) -> Target:
         """The value to be led to, given the guide's law N(mean, factor factorᵀ) of what is seen."""
 
     @abc.abstractmethod
-    def noise_from_target(self, law_mean: State, law_factor: Structured, seen: State) -> Float[Array, "extra m *dim"]:
+    def noise_from_target(
+        self, law_mean: State, law_factor: Structured, seen: State
+    ) -> Float[Array, "extra m *dim"]:
         """The extra noise with which `target` chooses `seen`."""
 
     def closed(self, x: State) -> "AbstractCondition":
-        """The same condition for states shaped like x, with what a user's functions read frozen as it is now."""
+        """The same condition for states shaped like x, with what a user's functions read frozen as
+        it is now.
+        """
         return self
 
     def anchored(
@@ -101,16 +113,20 @@ class AbstractCondition(eqx.Module):
         """The condition with what the rows of extra noise choose of it, before a path is led."""
         return self
 
-    def draw_of(self, x: State, shape: tuple[int, ...], key: PRNGKeyArray | None) -> Float[Array, "extra k *dim"]:
-        """Rows of extra noise for `drawn`, `shape`, of a path that is known, with the end state x."""
+    def draw_of(
+        self, x: State, shape: tuple[int, ...], key: PRNGKeyArray | None
+    ) -> Float[Array, "extra k *dim"]:
+        """Rows of extra noise for `drawn`, `shape`, of a path that is known and ends in x."""
         return jnp.zeros(shape, x.dtype)
 
     def correction(self, sde: AbstractSDE, x: State) -> Float[Array, ""]:
-        """Log density, at the end state x, of the condition less that of the observation that paths are led by."""
+        """Log density, at the end state x, of the condition less that of the observation that paths
+        are led by.
+        """
         return jnp.zeros((), x.dtype)
 
     def displaced(self, shift: State) -> "AbstractCondition":
-        """The condition on what is seen less `shift`; here by adding it again, which costs digits."""
+        """The condition on what is seen less `shift`; here by adding it, which costs digits."""
         return _Displaced(self, shift)
 
 
@@ -146,7 +162,9 @@ class _Displaced(AbstractCondition):
         return Target(target.value - self.shift, target.log_weight)
 
     def noise_from_target(self, law_mean, law_factor, seen):
-        return self.condition.noise_from_target(law_mean + self.shift, law_factor, seen + self.shift)
+        return self.condition.noise_from_target(
+            law_mean + self.shift, law_factor, seen + self.shift
+        )
 
 
 class AbstractMatch(eqx.Module):
@@ -161,11 +179,15 @@ class AbstractMatch(eqx.Module):
         """An observation of the end state x."""
 
     def closed(self, x: State, observed: State) -> Self:
-        """The same match for states like x and data like `observed`, with what a user's functions read frozen."""
+        """The same match for states like x and data like `observed`, with what a user's functions
+        read frozen.
+        """
         return self
 
     def example(self, sde: AbstractSDE, x: State) -> Array:
-        """A datum that could be seen of the state x: for its shape, and where the real one is masked."""
+        """A datum that could be seen of the state x: for its shape, and where the real one is
+        masked.
+        """
         return self.sample(jr.key(0), sde, x)
 
     @abc.abstractmethod

@@ -1,13 +1,14 @@
 """Curves that are matched as sets of edges: no point of one corresponds to a point of the other.
 
-A curve with edges of centres c_i and vectors τ_i is seen as μ = Σ_i δ(c_i, τ_i), and two of them are compared by the
-norm of a reproducing kernel, ‖μ − ν‖² = ⟨μ, μ⟩ − 2 ⟨μ, ν⟩ + ⟨ν, ν⟩,
+A curve with edges of centres c_i and vectors τ_i is seen as μ = Σ_i δ(c_i, τ_i), and two of them
+are compared by the norm of a reproducing kernel, ‖μ − ν‖² = ⟨μ, μ⟩ − 2 ⟨μ, ν⟩ + ⟨ν, ν⟩,
 
     currents              ⟨μ, ν⟩ = Σ_ij exp(−|c_i − d_j|²/ℓ²) τ_i · σ_j
     oriented varifolds    ⟨μ, ν⟩ = Σ_ij exp(−|c_i − d_j|²/ℓ²) exp(−|τ̂_i − σ̂_j|²/s²) |τ_i| |σ_j|,
 
-τ̂ = τ/|τ|: midpoint rules for double integrals along both curves. Glaunès, Qiu, Miller and Younes (2008); Kaltenmark,
-Charlier and Charon (2017), whose exp(2u/s²) of u = τ̂ · σ̂ is this up to a constant.
+τ̂ = τ/|τ|: midpoint rules for double integrals along both curves. Glaunès, Qiu, Miller and Younes
+(2008); Kaltenmark, Charlier and Charon (2017), whose exp(2u/s²) of u = τ̂ · σ̂ is this up to a
+constant.
 """
 
 from abc import abstractmethod
@@ -29,7 +30,9 @@ Points = Float[Array, "n dim"]
 
 
 class AbstractCurveMatch(AbstractDensityMatch):
-    """ψ(x) = exp(−‖μ_x − μ_v‖² / 2 variance), a kernel and no density of the curve v. A subclass gives `inner`."""
+    """ψ(x) = exp(−‖μ_x − μ_v‖² / 2 variance), a kernel and no density of the curve v. A subclass
+    gives `inner`.
+    """
 
     variance: eqx.AbstractVar[Float[Array, ""]]
     closed_curve: eqx.AbstractVar[bool]
@@ -71,8 +74,9 @@ class AbstractCurveMatch(AbstractDensityMatch):
             lengths = np.linalg.norm(edges, axis=1)
             require(
                 np.all(lengths > 0),
-                f"`observed` must have distinct neighbours; points {np.flatnonzero(lengths == 0)} are repeated by the "
-                "next one. Remove repeated points; the last point of a closed curve is not the first.",
+                f"`observed` must have distinct neighbours; points {np.flatnonzero(lengths == 0)} "
+                "are repeated by the next one. Remove repeated points; the last point of a closed "
+                "curve is not the first.",
             )
         return super().at(observed)
 
@@ -113,11 +117,12 @@ class CurrentMatch(AbstractCurveMatch):
 
 
 class VarifoldMatch(AbstractCurveMatch):
-    """Curves as oriented varifolds, ψ(x) = exp(−‖μ_x − μ_v‖² / 2 variance): outlines without correspondence.
+    """Curves as oriented varifolds, ψ(x) = exp(−‖μ_x − μ_v‖² / 2 variance): outlines without
+    correspondence.
 
-    The points of the end state, those of the curve where states are coefficients, and of the datum may
-    differ in number and in where they are on the curve. The norm is that of the curves, nearly, where
-    edges are short beside `length_scale`.
+    The points of the end state, those of the curve where states are coefficients, and of the datum
+    may differ in number and in where they are on the curve. The norm is that of the curves, nearly,
+    where edges are short beside `length_scale`.
 
     **Arguments:**
 

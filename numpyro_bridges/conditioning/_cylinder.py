@@ -1,14 +1,14 @@
 """Cylinder sets: the first coordinates of the end state in intervals, half-lines, points, or free.
 
-A path that is conditioned on a set is led to a point drawn inside it. The point is drawn from the guide's own Gaussian
-law of what is seen, N(μ, N Nᵀ) with N lower triangular, truncated one coordinate after the other (Genz 1992, the GHK
-simulator): w_i is a normal truncated to the interval that the earlier coordinates leave, and with r the density of the
-draw
+A path that is conditioned on a set is led to a point drawn inside it. The point is drawn from the
+guide's own Gaussian law of what is seen, N(μ, N Nᵀ) with N lower triangular, truncated one
+coordinate after the other (Genz 1992, the GHK simulator): w_i is a normal truncated to the interval
+that the earlier coordinates leave, and with r the density of the draw
 
     P(X_T ∈ Γ) = E[p(v | x0) / r(v)],      p / r = (p / N(v; μ, N Nᵀ)) Π_i P_i,
 
-P_i being the probability of that interval. All paths end in Γ. Where the guide's law is exact and its covariance
-diagonal, the weight is the product of the P_i, the same number for every noise.
+P_i being the probability of that interval. All paths end in Γ. Where the guide's law is exact and
+its covariance diagonal, the weight is the product of the P_i, the same number for every noise.
 """
 
 from typing import ClassVar
@@ -24,24 +24,31 @@ from .._linalg import solve_lower, varying_like
 from .._types import State, Structured
 from ..sdes import AbstractSDE
 from ._base import AbstractCondition, AbstractMatch, Observation, Target, lift
-from ._normal import _LOG_SQRT_2PI, log_interval_probability, truncated_quantile, truncated_quantile_inverse
+from ._normal import (
+    _LOG_SQRT_2PI,
+    log_interval_probability,
+    truncated_quantile,
+    truncated_quantile_inverse,
+)
 
 
 class CylinderSet(AbstractCondition):
     """The event that lower ≤ X_T ≤ upper, coordinate by coordinate.
 
-    Its evidence is the probability of the set (a density in the coordinates that are pinned to a point).
+    Its evidence is the probability of the set (a density in the coordinates that are pinned to a
+    point).
 
     **Arguments:**
 
-    - `lower`, `upper`: `(N, dim)`, or `(N,)` for plain vectors, or scalars broadcast to it, for the first N ≤ n rows of
-      the state: values at points or coefficients of an orthonormal basis. An infinite bound leaves that side free;
-      equal bounds pin the coordinate, and unequal ones never do, be they closer than single precision tells apart.
-      Rows whose bounds are known to be infinite, inside a traced function too, are left out. Bounds that are traced
-      themselves keep all their rows: the same probability, from other paths.
+    - `lower`, `upper`: `(N, dim)`, or `(N,)` for plain vectors, or scalars broadcast to it, for the
+      first N ≤ n rows of the state: values at points or coefficients of an orthonormal basis. An
+      infinite bound leaves that side free; equal bounds pin the coordinate, and unequal ones never
+      do, be they closer than single precision tells apart. Rows whose bounds are known to be
+      infinite, inside a traced function too, are left out. Bounds that are traced themselves keep
+      all their rows: the same probability, from other paths.
 
-    **Errors:** `ValueError` where `lower` exceeds `upper`, for NaN and for no rows. A traced `lower` above `upper`
-    weighs −inf, the set being empty; a traced NaN weighs NaN.
+    **Errors:** `ValueError` where `lower` exceeds `upper`, for NaN and for no rows. A traced
+    `lower` above `upper` weighs −inf, the set being empty; a traced NaN weighs NaN.
     """
 
     lower: State
@@ -57,7 +64,8 @@ class CylinderSet(AbstractCondition):
         shapes = lower.shape, upper.shape
         require(
             shapes[0] == shapes[1] or () in shapes,
-            f"`lower` and `upper` must have one shape, or one of them be a scalar; got {shapes[0]} and {shapes[1]}.",
+            f"`lower` and `upper` must have one shape, or one of them be a scalar; got {shapes[0]} "
+            f"and {shapes[1]}.",
         )
         lower, upper = jnp.broadcast_arrays(lower, upper)
         require(
@@ -81,8 +89,9 @@ class CylinderSet(AbstractCondition):
         n = x.shape[0]
         require(
             max(self.rows) < n and self.lower.shape[1:] == x.shape[1:],
-            f"`lower` and `upper` must have a row for each of at most {n} rows of a state {x.shape}, (N, dim) or (N,) "
-            f"like it; got rows of shape {self.lower.shape[1:]}, the last not free being number {max(self.rows)}.",
+            f"`lower` and `upper` must have a row for each of at most {n} rows of a state "
+            f"{x.shape}, (N, dim) or (N,) like it; got rows of shape {self.lower.shape[1:]}, the "
+            f"last not free being number {max(self.rows)}.",
         )
 
     def observation(self, sde, x):
@@ -93,7 +102,9 @@ class CylinderSet(AbstractCondition):
 
     def reference(self, sde, x):
         low, high = self.lower.astype(x.dtype), self.upper.astype(x.dtype)
-        return lift(self.observation(sde, x).operator, x, jnp.clip(x[np.array(self.rows)], low, high))
+        return lift(
+            self.observation(sde, x).operator, x, jnp.clip(x[np.array(self.rows)], low, high)
+        )
 
     def displaced(self, shift):
         def bounds(box):
@@ -102,12 +113,16 @@ class CylinderSet(AbstractCondition):
         return eqx.tree_at(bounds, self, (self.lower - shift, self.upper - shift))
 
     def _bounds(self, like: State) -> tuple[State, State, State, Array]:
-        """Both bounds and the lost width in the precision of a state, and which coordinates are pinned."""
+        """Both bounds and the lost width in the precision of a state, and which coordinates are
+        pinned.
+        """
         lower, upper, lost = (a.astype(like.dtype) for a in (self.lower, self.upper, self.lost))
         return lower, upper, lost, (self.lower == self.upper) & (self.lost == 0)
 
     def _scan(self, mean: State, factor: Structured, driver: State) -> tuple[State, State]:
-        """Coordinate after coordinate: the value chosen in its interval, and the log weight of the choice."""
+        """Coordinate after coordinate: the value chosen in its interval, and the log weight of the
+        choice.
+        """
         m = mean.shape[0]
         bounds = self._bounds(mean)
 
@@ -120,7 +135,8 @@ class CylinderSet(AbstractCondition):
             w = (value - center) / scale
             inside = log_interval_probability(*_free_where(pinned, low, high), center, scale, lost)
             chosen = inside + 0.5 * w * w + _LOG_SQRT_2PI + jnp.log(scale)
-            # a value without variance is outside the set, or inside, where its choice has no density
+            # a value without variance is outside the set, or inside, where its choice has no
+            # density
             chosen = jnp.where(empty, jnp.where(value == center, jnp.nan, -jnp.inf), chosen)
             return value, jnp.where(pinned, 0.0, chosen), w
 
@@ -158,7 +174,9 @@ class CylinderSet(AbstractCondition):
             scale = _column(jnp.diagonal(law_factor), seen)
             center = seen - scale * solve_lower(law_factor, seen - law_mean)
         scale = _column(scale, seen)
-        return truncated_quantile_inverse(seen, *_free_where(pinned, lower, upper), center, scale, lost)[None]
+        return truncated_quantile_inverse(
+            seen, *_free_where(pinned, lower, upper), center, scale, lost
+        )[None]
 
 
 def _bounded_rows(low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -170,8 +188,8 @@ def _bounded_rows(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     bad = ~((low <= high) & (low < np.inf) & (high > -np.inf))
     require(
         not bad.any(),
-        f"`lower` must not exceed `upper`, or the set is empty; got {low[bad][:1]} above {high[bad][:1]} in "
-        f"{int(bad.sum())} entries. Exchange them.",
+        f"`lower` must not exceed `upper`, or the set is empty; got {low[bad][:1]} above "
+        f"{high[bad][:1]} in {int(bad.sum())} entries. Exchange them.",
     )
     seen = (np.isfinite(low) | np.isfinite(high)).reshape(len(low), -1).any(1)
     return np.flatnonzero(seen) if seen.any() else np.arange(1)
@@ -197,7 +215,8 @@ def _column(d: Structured, x: State) -> Structured:
 class IntervalCensored(AbstractMatch):
     """Each coordinate is seen only as the number of the bin that it falls into.
 
-    **Arguments:** `cuts`: increasing cut points `(c,)`; bin 0 is below the first, bin c above the last.
+    **Arguments:** `cuts`: increasing cut points `(c,)`; bin 0 is below the first, bin c above the
+    last.
 
     `at(bins)` is the `CylinderSet` of these bins.
     """
@@ -227,12 +246,13 @@ class IntervalCensored(AbstractMatch):
         count = self.cuts.size
         require(
             numbers.size > 0 and numbers.ndim > 0,
-            f"`observed` must have one bin number per coordinate, (N,) or (N, dim); got shape {numbers.shape}.",
+            "`observed` must have one bin number per coordinate, (N,) or (N, dim); got shape "
+            f"{numbers.shape}.",
         )
         require(
             value is None or np.all((value == np.round(value)) & (value >= 0) & (value <= count)),
-            f"`observed` must hold bin numbers from 0 to {count}; got {value}. Values are put into bins by "
-            "`numpy.searchsorted(cuts, values)`.",
+            f"`observed` must hold bin numbers from 0 to {count}; got {value}. Values are put "
+            "into bins by `numpy.searchsorted(cuts, values)`.",
         )
         bins = jnp.clip(numbers, 0, count).astype(int)
         infinity = jnp.full((1,), jnp.inf, self.cuts.dtype)

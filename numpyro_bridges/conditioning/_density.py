@@ -4,14 +4,16 @@ A path is led by a Gaussian ψ̃ and weighed by ψ: with all steps guided to wha
 
     E[exp(log weight under ψ̃) ψ(X_T) / ψ̃(X_T)] = E ψ(X_T),
 
-exactly for any ψ̃, so that a poor one costs variance and no bias. It is found where the law N(m, S Sᵀ) of the end state,
-of the SDE linearised along its path without noise, meets ψ best: at the mode of log ψ(m + S ξ) − ½ |ξ|². There ψ is
-replaced by the Gaussian of the same slope whose precision is W,
+exactly for any ψ̃, so that a poor one costs variance and no bias. It is found where the law N(m, S
+Sᵀ) of the end state, of the SDE linearised along its path without noise, meets ψ best: at the mode
+of log ψ(m + S ξ) − ½ |ξ|². There ψ is replaced by the Gaussian of the same slope whose precision is
+W,
 
     ψ̃(x) = N(v; L x, I),      Lᵀ L = W,      v = L x* + L⁻ᵀ ∇log ψ(x*).
 
-Where ψ has heavier tails than that, weights have no variance. Then each path has a ψ̃ of its own, N(v; L x, I/τ) with
-log τ ~ N(0, s²), and what ψ is divided by is their mixture (the balance heuristic of Veach and Guibas 1995).
+Where ψ has heavier tails than that, weights have no variance. Then each path has a ψ̃ of its own,
+N(v; L x, I/τ) with log τ ~ N(0, s²), and what ψ is divided by is their mixture (the balance
+heuristic of Veach and Guibas 1995).
 """
 
 from abc import abstractmethod
@@ -40,14 +42,19 @@ _MOST_STEPS, _POLISHINGS = 20, 5
 _PARTS = 0.5 ** np.arange(8)
 """Of a step, the best of which is taken."""
 _GRID = np.linspace(-8.0, 8.0, 401)
-"""For integrals over the normal z of log τ = s z: the trapezoidal rule is exact, nearly, for what falls to 0."""
+"""For integrals over the normal z of log τ = s z: the trapezoidal rule is exact, nearly, for what
+falls to 0.
+"""
 _FLAT = 1e-3
-"""Least curvature of log ψ̃, beside that of the law of the end state: with less, v would be too far for its digits."""
+"""Least curvature of log ψ̃, beside that of the law of the end state: with less, v would be too far
+for its digits.
+"""
 _LOG_2PI = 1.8378770664093453
 
 
 class AbstractDensityMatch(AbstractMatch):
-    """A match that is known by log ψ(x), the log density of what is observed, given the end state x.
+    """A match that is known by log ψ(x), the log density of what is observed, given the end state
+    x.
 
     A subclass gives `log_density`. Where it is no density of an observation, such as a kernel of a
     distance between curves, evidence is that of the kernel: ratios of it compare parameters of the
@@ -57,7 +64,9 @@ class AbstractDensityMatch(AbstractMatch):
 
     @property
     def spread(self) -> Float[Array, ""] | None:
-        """s, the standard deviation of log τ, for a ψ whose tails are heavier than those of a normal density."""
+        """s, the standard deviation of log τ, for a ψ whose tails are heavier than those of a
+        normal density.
+        """
         return None
 
     @abstractmethod
@@ -83,12 +92,15 @@ class AbstractDensityMatch(AbstractMatch):
 
     def sample(self, key: PRNGKeyArray, sde: AbstractSDE, x: State) -> Array:
         raise ValueError(
-            f"{type(self).__name__} weighs the end state and is no law of an observation, so nothing can be drawn from "
-            "it. Draw end states by `simulate`, or give the match a `sample` of its own."
+            f"{type(self).__name__} weighs the end state and is no law of an observation, so "
+            "nothing can be drawn from it. Draw end states by `simulate`, or give the match a "
+            "`sample` of its own."
         )
 
     def example(self, sde: AbstractSDE, x: State) -> Array:
-        """An observation, the end state x itself, where a subclass does not say that data look otherwise."""
+        """An observation, the end state x itself, where a subclass does not say that data look
+        otherwise.
+        """
         return x
 
     def check_density(self) -> None:
@@ -100,13 +112,15 @@ class DensityMatch(AbstractDensityMatch):
 
     **Arguments:**
 
-    - `log_density`: `f(x, observed, args)`, log ψ(x) for the datum `observed`: a finite number, smooth in x.
-    - `args`: its parameters, a pytree of arrays. What a prior is put on belongs here; then ψ must be normalised as a
-      density of `observed`.
-    - `sample`: `f(key, x, args)`, a draw of what is observed of the end state x. Without it laws have a density and
-      draw nothing, and data are shaped like states.
-    - `spread`: for a ψ with heavy tails, the standard deviation of the log of a factor by which each path widens the
-      normal density that leads it, such as 1.0 in few dimensions; it costs a row of noise.
+    - `log_density`: `f(x, observed, args)`, log ψ(x) for the datum `observed`: a finite number,
+      smooth in x.
+    - `args`: its parameters, a pytree of arrays. What a prior is put on belongs here; then ψ must
+      be normalised as a density of `observed`.
+    - `sample`: `f(key, x, args)`, a draw of what is observed of the end state x. Without it laws
+      have a density and draw nothing, and data are shaped like states.
+    - `spread`: for a ψ with heavy tails, the standard deviation of the log of a factor by which
+      each path widens the normal density that leads it, such as 1.0 in few dimensions; it costs a
+      row of noise.
 
     The function is held as it is when a bridge or a law is made, as for `SDE`.
     """
@@ -233,8 +247,8 @@ class _DensityCondition(AbstractCondition):
         shape = jax.eval_shape(lambda: self._log_density(sde, x)).shape
         require(
             shape == (),
-            f"`log_density` must return one number; got shape {shape} for a state {x.shape} and an observation "
-            f"{self.observed.shape}.",
+            f"`log_density` must return one number; got shape {shape} for a state {x.shape} and "
+            f"an observation {self.observed.shape}.",
         )
 
     def _log_density(self, sde: AbstractSDE, x: State):
@@ -250,8 +264,8 @@ class _DensityCondition(AbstractCondition):
             values = concrete(values)
             require(
                 values is None or jnp.all(jnp.isfinite(values)),
-                f"`log_density` must be finite and smooth; the {what}log density is {values} at the state "
-                f"{concrete(guiding.anchor)}, where paths are led to by it.",
+                f"`log_density` must be finite and smooth; the {what}log density is {values} at "
+                f"the state {concrete(guiding.anchor)}, where paths are led to by it.",
             )
         return self._with(guiding=guiding)
 
@@ -328,7 +342,9 @@ def _root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def _mode(
     log_density: Callable, precision: Callable, mean: Float[Array, " N"], root: Float[Array, "N N"]
 ):
-    """The ξ of the largest log ψ(m + S ξ) − ½ |ξ|², by Gauss and Newton; its derivatives by the implicit function."""
+    """The ξ of the largest log ψ(m + S ξ) − ½ |ξ|², by Gauss and Newton; its derivatives by the
+    implicit function.
+    """
 
     def loss(xi):
         return 0.5 * jnp.sum(xi * xi) - log_density(mean + root @ xi)

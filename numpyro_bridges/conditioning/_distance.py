@@ -1,4 +1,5 @@
-"""Matches that are functions of a distance in the H-norm: of heavy tails, and to a shape wherever it lies.
+"""Matches that are functions of a distance in the H-norm: of heavy tails, and to a shape wherever
+it lies.
 
 With r² = Σ_i w_i |x_i − v_i|² / variance, m numbers in all and w the weights of the space,
 
@@ -24,13 +25,14 @@ _LOG_PI = 1.1447298858494002
 
 
 class StudentMatch(AbstractDensityMatch):
-    """The end state is seen with an error from a multivariate Student distribution: `InexactMatch` with heavy tails.
+    """The end state is seen with an error from a multivariate Student distribution: `InexactMatch`
+    with heavy tails.
 
-    All numbers of a datum share one scale of the error, drawn anew for each datum, so that a datum that
-    lies far off counts less.
+    All numbers of a datum share one scale of the error, drawn anew for each datum, so that a datum
+    that lies far off counts less.
 
-    **Arguments:** `variance`: as of `InexactMatch`, a number, at infinitely many degrees of freedom.
-    `degrees_of_freedom`: ν, positive.
+    **Arguments:** `variance`: as of `InexactMatch`, a number, at infinitely many degrees of
+    freedom. `degrees_of_freedom`: ν, positive.
     """
 
     variance: Float[Array, ""]
@@ -66,10 +68,12 @@ class StudentMatch(AbstractDensityMatch):
 
 
 class HuberMatch(AbstractDensityMatch):
-    """The end state is seen with an error whose density is normal near 0 and falls exponentially far away.
+    """The end state is seen with an error whose density is normal near 0 and falls exponentially
+    far away.
 
-    **Arguments:** `variance`: as of `InexactMatch`, a number. `threshold`: k, the distance, in standard deviations,
-    from which on the loss is linear. In many numbers m the distance is about √m.
+    **Arguments:** `variance`: as of `InexactMatch`, a number. `threshold`: k, the distance, in
+    standard deviations, from which on the loss is linear. In many numbers m the distance is about
+    √m.
     """
 
     variance: Float[Array, ""]
@@ -109,12 +113,15 @@ class HuberMatch(AbstractDensityMatch):
 
 
 class ProcrustesMatch(AbstractDensityMatch):
-    """ψ(x) = exp(−d²/2 variance), d the H-norm distance of x to a shape wherever it lies: a set of states.
+    """ψ(x) = exp(−d²/2 variance), d the H-norm distance of x to a shape wherever it lies: a set of
+    states.
 
-    d is the least distance over all motions of the datum. It is a kernel and no density of the datum.
+    d is the least distance over all motions of the datum. It is a kernel and no density of the
+    datum.
 
-    **Arguments:** `variance`: as of `InexactMatch`, a number. `up_to`: the motions: `"translation"`, `"rigid"`, with
-    rotations, or `"similarity"`, with scale too. Reflections are none of them. Shapes in the plane or in space.
+    **Arguments:** `variance`: as of `InexactMatch`, a number. `up_to`: the motions:
+    `"translation"`, `"rigid"`, with rotations, or `"similarity"`, with scale too. Reflections are
+    none of them. Shapes in the plane or in space.
     """
 
     variance: Float[Array, ""]
@@ -129,8 +136,8 @@ class ProcrustesMatch(AbstractDensityMatch):
         dims = (1, 2, 3) if self.up_to == "translation" else (2, 3)
         require(
             are_points and x.ndim == 2 and x.shape[1] in dims,
-            f"`x0` must hold points in the plane or in space, (n, 2) or (n, 3); got a state {x.shape} "
-            f"of {sde.space}.",
+            "`x0` must hold points in the plane or in space, (n, 2) or (n, 3); got a state "
+            f"{x.shape} of {sde.space}.",
         )
         weights = _weights(sde, x)
         v = _centred(weights, _like(observed, x))
@@ -175,7 +182,9 @@ def _square(variance, sde: AbstractSDE, x: State, observed: State):
 
 
 def _reweighted(weight: Array, variance: Array, sde: AbstractSDE, x: State) -> Float[Array, "N N"]:
-    """The precision of least squares that are weighted again and again: ψ' of the slope, the same in all directions."""
+    """The precision of least squares that are weighted again and again: ψ' of the slope, the same
+    in all directions.
+    """
     precision = weight * _weights(sde, x) / variance.astype(x.dtype)
     return jnp.diag(jnp.repeat(precision, x.size // x.shape[0]))
 

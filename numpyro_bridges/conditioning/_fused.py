@@ -4,9 +4,10 @@ A product of Gaussian densities is a constant and one Gaussian density of the sa
 
     Π_i N(v_i; L_i x, Σ_i) = exp(c) N(v; L x, Σ).
 
-Where all rows have one match, v is the mean of r values and Σ = Σ_1 / r. Where errors are independent, v is the mean
-weighted by precision. In general v = R⁻¹ Σ_i L_iᵀ Σ_i⁻¹ v_i, L = Rᵀ and Σ = 1, with R Rᵀ = Σ_i L_iᵀ Σ_i⁻¹ L_i. The
-constant is that of any one state, such as one near the data, where no density is small.
+Where all rows have one match, v is the mean of r values and Σ = Σ_1 / r. Where errors are
+independent, v is the mean weighted by precision. In general v = R⁻¹ Σ_i L_iᵀ Σ_i⁻¹ v_i, L = Rᵀ and
+Σ = 1, with R Rᵀ = Σ_i L_iᵀ Σ_i⁻¹ L_i. The constant is that of any one state, such as one near the
+data, where no density is small.
 """
 
 from collections.abc import Callable
@@ -34,11 +35,14 @@ def fused(
 ) -> AbstractCondition:
     """For each of several states one condition, along a leading axis.
 
-    **Arguments:** `values`: first `sizes[0]` observations of the first state, then `sizes[1]` of the second, and so on;
-    `match`: an inexact one, the same for all, or `own`, one for each value along a leading axis; `x`: a state.
+    **Arguments:** `values`: first `sizes[0]` observations of the first state, then `sizes[1]` of
+    the second, and so on; `match`: an inexact one, the same for all, or `own`, one for each value
+    along a leading axis; `x`: a state.
     """
     owner = np.repeat(np.arange(len(sizes)), sizes)
-    values = jax.vmap(lambda match, v: match.at(v).observed, in_axes=(0 if own else None, 0))(match, values)
+    values = jax.vmap(lambda match, v: match.at(v).observed, in_axes=(0 if own else None, 0))(
+        match, values
+    )
 
     def total(a: Array) -> Array:
         return jnp.zeros((len(sizes), *a.shape[1:]), a.dtype).at[owner].add(a)
@@ -52,35 +56,48 @@ def fused(
     return (_independent if is_diagonal else _dense)(seen, values, owner, total, x)
 
 
-def _of_one_match(seen: Observation, values, owner, sizes, total: Callable[[Array], Array]) -> AbstractCondition:
+def _of_one_match(
+    seen: Observation, values, owner, sizes, total: Callable[[Array], Array]
+) -> AbstractCondition:
     count, one_factor = jnp.asarray(sizes, values.dtype), seen.factor
     assert one_factor is not None
     mean = total(values) / rows(count, values)
-    density = jax.vmap(lambda r: gaussian_log_density(r, one_factor) + seen.log_scale)(values - mean[owner])
+    density = jax.vmap(lambda r: gaussian_log_density(r, one_factor) + seen.log_scale)(
+        values - mean[owner]
+    )
     factor = jax.vmap(lambda r: one_factor / jnp.sqrt(r))(count)
     constant = total(density) - jax.vmap(gaussian_log_density)(jnp.zeros_like(mean), factor)
     operator = jnp.broadcast_to(seen.operator, (len(sizes), *seen.operator.shape))
     return _Seen(_Fused(Observation(operator, factor, constant)), mean)
 
 
-def _independent(seen: Observation, values, owner, total: Callable[[Array], Array], x: State) -> AbstractCondition:
+def _independent(
+    seen: Observation, values, owner, total: Callable[[Array], Array], x: State
+) -> AbstractCondition:
     """A precision for each row of a state; it is 0 where nothing is seen."""
     assert seen.factor is not None
     ndim = max(seen.operator.ndim, seen.factor.ndim)
-    operator, factor = (a.reshape(a.shape + (1,) * (ndim - a.ndim)) for a in (seen.operator, seen.factor))
+    operator, factor = (
+        a.reshape(a.shape + (1,) * (ndim - a.ndim)) for a in (seen.operator, seen.factor)
+    )
     precision = (operator / factor) ** 2
     together = total(precision)
     there = together > 0
     together = jnp.where(there, together, 1.0)
     weighted = total(jax.vmap(apply)(precision, values))
     mean = jax.vmap(lambda h, f: apply(1 / h, f))(together, weighted)
-    fused_seen = Observation(there.astype(x.dtype), 1 / jnp.sqrt(together), jnp.zeros(len(together), x.dtype))
+    fused_seen = Observation(
+        there.astype(x.dtype), 1 / jnp.sqrt(together), jnp.zeros(len(together), x.dtype)
+    )
     return _with_constant(seen, values, owner, total, fused_seen, mean, mean)
 
 
-def _dense(seen: Observation, values, owner, total: Callable[[Array], Array], x: State) -> AbstractCondition:
+def _dense(
+    seen: Observation, values, owner, total: Callable[[Array], Array], x: State
+) -> AbstractCondition:
     n, one = x.shape[0], jnp.ones((), x.dtype)
-    nugget = 10 * n * jnp.finfo(x.dtype).eps if seen.operator.ndim == 3 else 0.0  # operators may leave directions open
+    # operators may leave directions open
+    nugget = 10 * n * jnp.finfo(x.dtype).eps if seen.operator.ndim == 3 else 0.0
 
     def information(operator, factor, v):
         H, F, _ = GaussianMessage(operator, jnp.zeros_like(v), factor, v, 0 * one).information(n)
@@ -92,20 +109,28 @@ def _dense(seen: Observation, values, owner, total: Callable[[Array], Array], x:
 
     start = jnp.broadcast_to(x, (owner[-1] + 1, *x.shape))
     H, F = pull(start)
-    R = jax.vmap(lambda H: cholesky(H + nugget * jnp.max(jnp.diagonal(H)) * jnp.eye(n, dtype=x.dtype)))(H)
+    R = jax.vmap(
+        lambda H: cholesky(H + nugget * jnp.max(jnp.diagonal(H)) * jnp.eye(n, dtype=x.dtype))
+    )(H)
     near = start + jax.vmap(lambda R, F: solve_lower(R, solve_lower(R, F), transposed=True))(R, F)
     _, F = pull(near)
     operator = R.transpose(0, 2, 1)
     value = jax.vmap(lambda R, F, y: solve_lower(R, F) + R.T @ y)(R, F, near)
     ones = jnp.ones(len(R), x.dtype)
-    return _with_constant(seen, values, owner, total, Observation(operator, ones, 0 * ones), value, near)
+    return _with_constant(
+        seen, values, owner, total, Observation(operator, ones, 0 * ones), value, near
+    )
 
 
-def _with_constant(seen: Observation, values, owner, total, one: Observation, value, near: State) -> AbstractCondition:
+def _with_constant(
+    seen: Observation, values, owner, total, one: Observation, value, near: State
+) -> AbstractCondition:
     """`one` with the constant that makes it the product at the states `near`, hence anywhere."""
 
     def log_density(seen, v, x):
         return gaussian_log_density(v - apply(seen.operator, x), seen.factor) + seen.log_scale
 
-    constant = total(jax.vmap(log_density)(seen, values, near[owner])) - jax.vmap(log_density)(one, value, near)
+    constant = total(jax.vmap(log_density)(seen, values, near[owner])) - jax.vmap(log_density)(
+        one, value, near
+    )
     return _Seen(_Fused(Observation(one.operator, one.factor, constant)), value)

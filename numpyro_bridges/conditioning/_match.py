@@ -48,7 +48,8 @@ class _Seen(AbstractCondition):
         n = x.shape[0]
         require(
             operator.ndim == 0 or operator.shape[-1] == n,
-            f"`operator` must have {n} columns, as many as the state has rows; got shape {operator.shape}.",
+            f"`operator` must have {n} columns, as many as the state has rows; got shape "
+            f"{operator.shape}.",
         )
         m = operator.shape[0] if operator.ndim == 2 else n
         shape = (m, *x.shape[1:])
@@ -97,15 +98,16 @@ class ExactMatch(AbstractMatch):
 
     There is no limit as the number of coordinates grows; it is part of the model.
 
-    It needs noise in every direction that is seen, and an SDE that is known to have none is refused. Where a traced
-    parameter takes the noise away (a scale that underflows), the log weight is −inf, the datum being out of reach, or
-    NaN where it is met to the last digit: there is no density then.
+    It needs noise in every direction that is seen, and an SDE that is known to have none is
+    refused. Where a traced parameter takes the noise away (a scale that underflows), the log weight
+    is −inf, the datum being out of reach, or NaN where it is met to the last digit: there is no
+    density then.
 
     **Arguments:**
 
     - `operator`: L, `(m, n)` or a lineax operator; the identity if not given.
-    - `mask`: `(n,)` booleans instead of `operator`: which rows are seen. It is a constant, inside a traced function
-      too, since it says how many rows a datum has.
+    - `mask`: `(n,)` booleans instead of `operator`: which rows are seen. It is a constant, inside a
+      traced function too, since it says how many rows a datum has.
     """
 
     operator: Structured
@@ -116,8 +118,8 @@ class ExactMatch(AbstractMatch):
             require(operator is None, "Give `operator` or `mask`, not both.")
             require(
                 not _is_traced(mask),
-                "`mask` of an exact match must be known when the program is traced; got a traced array. Give a NumPy "
-                "array, or use InexactMatch.",
+                "`mask` of an exact match must be known when the program is traced; got a traced "
+                "array. Give a NumPy array, or use InexactMatch.",
             )
             keep = _mask(mask)
             require(keep.any(), "`mask` must leave at least one row to be seen; got all False.")
@@ -139,24 +141,28 @@ class ExactMatch(AbstractMatch):
 
 
 class InexactMatch(AbstractMatch):
-    """The end state is seen with Gaussian noise of a given variance in the H-norm, exp(−‖L X_T − v‖²_H / 2 variance).
+    """The end state is seen with Gaussian noise of a given variance in the H-norm, exp(−‖L X_T −
+    v‖²_H / 2 variance).
 
-    With quadrature weights w the noise of point i has variance `variance / w_i`: on a curve of n points the same
-    `variance` gives the same likelihood as n grows.
+    With quadrature weights w the noise of point i has variance `variance / w_i`: on a curve of n
+    points the same `variance` gives the same likelihood as n grows.
 
     **Arguments:**
 
-    - `variance`: σ, positive: a number, or `(m,)` or `(m, m)` to be divided by the weights in the same way.
-    - `operator`: L, `(m, n)` or a lineax operator; the identity if not given. An operator whose every row is a row of
-      the identity, a selection of points, keeps their weights; any other is seen in the Euclidean norm of R^m. Its
-      values say which it is, wherever the match is built.
-    - `mask`: `(n,)` booleans instead of `operator`: which rows are seen. The datum's other rows are ignored.
-    - `space`: whose weights to use; the SDE's if not given, Euclidean where it has none. A space with one weight for
-      each row that an operator sees gives those rows its weights.
-    - `normalised`: `True` is the Lebesgue density of the observation. `False` is the kernel itself, whose expectation
-      has a limit as n → ∞; it is no density, so distributions refuse it.
+    - `variance`: σ, positive: a number, or `(m,)` or `(m, m)` to be divided by the weights in the
+      same way.
+    - `operator`: L, `(m, n)` or a lineax operator; the identity if not given. An operator whose
+      every row is a row of the identity, a selection of points, keeps their weights; any other is
+      seen in the Euclidean norm of R^m. Its values say which it is, wherever the match is built.
+    - `mask`: `(n,)` booleans instead of `operator`: which rows are seen. The datum's other rows are
+      ignored.
+    - `space`: whose weights to use; the SDE's if not given, Euclidean where it has none. A space
+      with one weight for each row that an operator sees gives those rows its weights.
+    - `normalised`: `True` is the Lebesgue density of the observation. `False` is the kernel itself,
+      whose expectation has a limit as n → ∞; it is no density, so distributions refuse it.
 
-    `InexactMatch.from_point_sd(sd, space)` takes the standard deviation of one point's coordinate instead.
+    `InexactMatch.from_point_sd(sd, space)` takes the standard deviation of one point's coordinate
+    instead.
     """
 
     variance: Structured
@@ -167,7 +173,13 @@ class InexactMatch(AbstractMatch):
     exact: ClassVar[bool] = False
 
     def __init__(
-        self, variance, operator=None, space: AbstractSpace | None = None, normalised: bool = True, *, mask=None
+        self,
+        variance,
+        operator=None,
+        space: AbstractSpace | None = None,
+        normalised: bool = True,
+        *,
+        mask=None,
     ):
         require(operator is None or mask is None, "Give `operator` or `mask`, not both.")
         self.variance = as_float(variance, "variance")
@@ -177,15 +189,20 @@ class InexactMatch(AbstractMatch):
             f"`variance` must be a number, (m,) or a matrix (m, m); got shape {shape}.",
         )
         if space is not None:
-            require_instance(space, AbstractSpace, "space", "a space, whose weights to use, or left out")
+            require_instance(
+                space, AbstractSpace, "space", "a space, whose weights to use, or left out"
+            )
         if self.variance.ndim < 2:
-            require_positive(self.variance, "variance", "For an observation without noise use ExactMatch.")
+            require_positive(
+                self.variance, "variance", "For an observation without noise use ExactMatch."
+            )
         elif concrete(self.variance) is not None:
             factor = cholesky(self.variance)
             require(
                 jnp.all(jnp.isfinite(factor)) & jnp.allclose(self.variance, self.variance.T),
-                "`variance` must be a symmetric, positive definite matrix; its Cholesky factorisation fails. "
-                "Observe fewer combinations, or add a small multiple of the identity.",
+                "`variance` must be a symmetric, positive definite matrix; its Cholesky "
+                "factorisation fails. Observe fewer combinations, or add a small multiple of the "
+                "identity.",
             )
         self.mask = None if mask is None else jnp.asarray(_mask(mask))
         self.operator = _operator(operator)
@@ -194,10 +211,14 @@ class InexactMatch(AbstractMatch):
 
     @classmethod
     def from_point_sd(cls, sd, space: AbstractSpace, **kwargs) -> "InexactMatch":
-        """From the standard deviation of one coordinate of one point (of average weight): variance = sd² · mean(w)."""
+        """From the standard deviation of one coordinate of one point (of average weight): variance
+        = sd² · mean(w).
+        """
         sd = as_float(sd, "sd")
         require_positive(sd, "sd", "For an observation without noise use ExactMatch.")
-        require_instance(space, AbstractSpace, "space", "a space, whose weights say how far a point counts")
+        require_instance(
+            space, AbstractSpace, "space", "a space, whose weights say how far a point counts"
+        )
         return cls(sd**2 * jnp.mean(space.weights), space=space, **kwargs)
 
     def at(self, observed) -> AbstractCondition:
@@ -214,7 +235,8 @@ class InexactMatch(AbstractMatch):
         own = self.space is not None and weights.shape == (m,)
         require(
             own or weights.shape == (n,),
-            f"`space` must have one weight per row of the state, {n}, or per observed row, {m}; got {weights.shape}.",
+            f"`space` must have one weight per row of the state, {n}, or per observed row, {m}; "
+            f"got {weights.shape}.",
         )
         if self.operator.ndim == 0:
             return weights
@@ -222,19 +244,26 @@ class InexactMatch(AbstractMatch):
         if weights.shape != (n,):
             return others
         picked = self.operator == 1
-        is_selection = jnp.all(picked | (self.operator == 0)) & jnp.all(jnp.sum(picked, axis=1) == 1)
-        return jnp.where(is_selection, jnp.sum(jnp.where(picked, weights[None], 0.0), axis=1), others)
+        is_selection = jnp.all(picked | (self.operator == 0)) & jnp.all(
+            jnp.sum(picked, axis=1) == 1
+        )
+        return jnp.where(
+            is_selection, jnp.sum(jnp.where(picked, weights[None], 0.0), axis=1), others
+        )
 
     def _factor(self, sde: AbstractSDE, x: State) -> Structured:
         m = self.operator.shape[0] if self.operator.ndim == 2 else x.shape[0]
         variance = symmetric(self.variance.astype(x.dtype))
         require(
             variance.ndim == 0 or variance.shape[0] == m,
-            f"`variance` must be a scalar or have {m} rows, one per observed row; got shape {variance.shape}.",
+            f"`variance` must be a scalar or have {m} rows, one per observed row; got shape "
+            f"{variance.shape}.",
         )
         weights = self._weights(sde, x)
         if weights is not None:
-            variance = congruence(1 / jnp.sqrt(weights), variance) if variance.ndim else variance / weights
+            variance = (
+                congruence(1 / jnp.sqrt(weights), variance) if variance.ndim else variance / weights
+            )
         return cholesky(variance)
 
     def observation(self, sde: AbstractSDE, x: State) -> Observation:
@@ -245,7 +274,8 @@ class InexactMatch(AbstractMatch):
         if self.mask is not None:
             require(
                 self.mask.shape == (m,) and factor.ndim < 2,
-                f"`mask` must have shape {(m,)} and go with independent noise; got {self.mask.shape}.",
+                f"`mask` must have shape {(m,)} and go with independent noise; got "
+                f"{self.mask.shape}.",
             )
             operator = self.mask.astype(x.dtype)
             rows = jnp.where(self.mask, 0.0, rows) if self.normalised else rows
@@ -261,8 +291,9 @@ class InexactMatch(AbstractMatch):
     def check_density(self) -> None:
         require(
             self.normalised,
-            "`normalised=False` is a kernel and no density of what is sampled, so it cannot be a likelihood: "
-            "use `normalised=True` here, and `normalised=False` with `GuidedBridge` and `estimate_evidence`.",
+            "`normalised=False` is a kernel and no density of what is sampled, so it cannot be a "
+            "likelihood: use `normalised=True` here, and `normalised=False` with `GuidedBridge` "
+            "and `estimate_evidence`.",
         )
 
 
@@ -276,15 +307,19 @@ def _operator(operator) -> Structured:
     operator = as_float(operator, "operator")
     require(
         operator.ndim == 2,
-        f"`operator` must be a matrix (m, n) with one row per observed value; got shape {operator.shape}.",
+        "`operator` must be a matrix (m, n) with one row per observed value; got shape "
+        f"{operator.shape}.",
     )
-    require(operator.size >= 1, f"`operator` must see at least one value of at least one row; got {operator.shape}.")
+    require(
+        operator.size >= 1,
+        f"`operator` must see at least one value of at least one row; got {operator.shape}.",
+    )
     if value is not None:
         require_finite(value, "operator")
         require(
             np.linalg.matrix_rank(value) == len(value),
-            f"`operator` must have independent rows; its rank is below its {operator.shape[0]} rows. "
-            "Remove repeated observations.",
+            f"`operator` must have independent rows; its rank is below its {operator.shape[0]} "
+            "rows. Remove repeated observations.",
         )
     return operator
 
@@ -316,8 +351,11 @@ def _datum(observed, mask=None) -> State:
     v = as_float(observed, "observed")
     if mask is not None:
         require(
-            v.shape[:1] == mask.shape, f"`observed` must have {mask.shape[0]} rows, like `mask`; got shape {v.shape}."
+            v.shape[:1] == mask.shape,
+            f"`observed` must have {mask.shape[0]} rows, like `mask`; got shape {v.shape}.",
         )
         v = jnp.where(mask.reshape(mask.shape + (1,) * (v.ndim - 1)), v, 0.0)
-    require_finite(v, "observed", "Missing points are declared by `mask=` or left out by `operator=`.")
+    require_finite(
+        v, "observed", "Missing points are declared by `mask=` or left out by `operator=`."
+    )
     return v

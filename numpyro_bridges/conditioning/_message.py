@@ -1,17 +1,29 @@
-"""A Gaussian message: a linear observation of a state with Gaussian noise, as a function of the state.
+"""A Gaussian message: a linear observation of a state with Gaussian noise, as a function of the
+state.
 
     h(x) = exp(log_scale) N(v; L x + shift, P Pᵀ ⊗ I_dim)
 
-This covariance form holds what a backward filter passes on: it stays finite for exact observations (P = 0) and costs no
-more than the information form h(x) = exp(c + Fᵀx − ½ xᵀHx), since L has at most as many rows as the state. Any Gaussian
-message, of any rank, has it: with H = RᵀR take L = R, P = 1.
+This covariance form holds what a backward filter passes on: it stays finite for exact observations
+(P = 0) and costs no more than the information form h(x) = exp(c + Fᵀx − ½ xᵀHx), since L has at
+most as many rows as the state. Any Gaussian message, of any rank, has it: with H = RᵀR take L = R,
+P = 1.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import apply, columns, filled, log_diagonal, promote, rows, solve_lower, transpose, without_variance
+from .._linalg import (
+    apply,
+    columns,
+    filled,
+    log_diagonal,
+    promote,
+    rows,
+    solve_lower,
+    transpose,
+    without_variance,
+)
 from .._types import State, Structured
 
 _LOG_2PI = 1.8378770664093453
@@ -32,11 +44,15 @@ class GaussianMessage(eqx.Module):
 
     def log_value(self, x: State) -> Float[Array, ""]:
         """log h(x)."""
-        return self.log_scale + gaussian_log_density(self.observed - self.shift - apply(self.operator, x), self.factor)
+        return self.log_scale + gaussian_log_density(
+            self.observed - self.shift - apply(self.operator, x), self.factor
+        )
 
     def score(self, x: State) -> State:
         """∇ log h(x) = Lᵀ (P Pᵀ)⁻¹ (v − L x − shift)."""
-        return apply(transpose(self.operator), solve_lower(self.factor, self.residual(x), transposed=True))
+        return apply(
+            transpose(self.operator), solve_lower(self.factor, self.residual(x), transposed=True)
+        )
 
     def information(self, n: int) -> tuple[Float[Array, "n n"], State, Float[Array, ""]]:
         """H, F and c with log h(x) = c + Fᵀx − ½ xᵀHx, for states of n rows."""
@@ -56,7 +72,8 @@ def gaussian_log_density(r: State, factor: Structured) -> Float[Array, ""]:
 def where_possible(r: State, empty: Array, log_value: Float[Array, ""]) -> Float[Array, ""]:
     """A log density of r, whose coordinates have no variance where `empty`, by `without_variance`.
 
-    If one of those is not 0 there is no such r, and the density is 0. If it is 0 there is no density: NaN.
+    If one of those is not 0 there is no such r, and the density is 0. If it is 0 there is no
+    density: NaN.
     """
     there = empty if empty.ndim == 0 else rows(empty, r)
     impossible = jnp.any(there & (r != 0))

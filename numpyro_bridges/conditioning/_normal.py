@@ -1,14 +1,15 @@
-"""Normal probabilities of intervals, and normals truncated to them: far and near, wide and narrow, in log space.
+"""Normal probabilities of intervals, and normals truncated to them: far and near, wide and narrow,
+in log space.
 
-An interval of N(mean, scale²) is mirrored until its middle is not negative and held, in standard units, by its near end
-s and its width d, each by itself: s + d may round to s, and a probability is of the size of d. With Mills' ratio
-m(t) = (1 − Φ(t))/φ(t),
+An interval of N(mean, scale²) is mirrored until its middle is not negative and held, in standard
+units, by its near end s and its width d, each by itself: s + d may round to s, and a probability is
+of the size of d. With Mills' ratio m(t) = (1 − Φ(t))/φ(t),
 
     P = φ(s) I(s, d),      I(s, d) = ∫₀^d exp(−s v − v²/2) dv = m(s) − m(s + d) exp(−s d − d²/2)
 
-has every digit however far out, log φ(s) being a square; a short I is a quadrature. Only where 0 lies well inside is P
-the complement of two tails. A draw s + u solves I(s, u) = p I(s, d), by Newton's method in the cumulative hazard
-−log(1 − I(s, u)/m(s)), which is convex in u.
+has every digit however far out, log φ(s) being a square; a short I is a quadrature. Only where 0
+lies well inside is P the complement of two tails. A draw s + u solves I(s, u) = p I(s, d), by
+Newton's method in the cumulative hazard −log(1 − I(s, u)/m(s)), which is convex in u.
 """
 
 from collections.abc import Callable
@@ -41,7 +42,9 @@ _NODES, _WEIGHTS = 0.5 + 0.5 * _ROOTS, 0.5 * _GAUSS
 
 
 class _Mirrored(NamedTuple):
-    """[s, s + d] or [−s − d, −s] by `sign`, s + d/2 ≥ 0; d is inf for a half-line, 0 for an empty set."""
+    """[s, s + d] or [−s − d, −s] by `sign`, s + d/2 ≥ 0; d is inf for a half-line, 0 for an empty
+    set.
+    """
 
     sign: Array
     s: Array
@@ -49,7 +52,9 @@ class _Mirrored(NamedTuple):
     free: Array
 
 
-def _mirrored(lower: Array, upper: Array, mean: ArrayLike, scale: ArrayLike, lost: ArrayLike) -> _Mirrored:
+def _mirrored(
+    lower: Array, upper: Array, mean: ArrayLike, scale: ArrayLike, lost: ArrayLike
+) -> _Mirrored:
     no_lower, no_upper = jnp.isinf(lower), jnp.isinf(upper)
     low, high = jnp.where(no_lower, 0.0, lower), jnp.where(no_upper, 0.0, upper)
     a, b = (low - mean) / scale, (high - mean) / scale
@@ -160,7 +165,8 @@ def log_interval_probability(
     scale: ArrayLike = 1.0,
     lost: ArrayLike = 0.0,
 ) -> Float[Array, "..."]:
-    """log P(lower ≤ N(mean, scale²) ≤ upper); bounds may be infinite. −inf for an empty interval, NaN for NaN.
+    """log P(lower ≤ N(mean, scale²) ≤ upper); bounds may be infinite. −inf for an empty interval,
+    NaN for NaN.
 
     `lost`: what upper − lower has lost by rounding of the bounds.
     """
@@ -174,7 +180,9 @@ def log_interval_probability(
 def _log_ndtri(log_p: Float[Array, "..."]) -> Float[Array, "..."]:
     """The normal quantile of exp(log_p), from the logarithm: finite where exp(log_p) underflows."""
     start = jnp.where(
-        log_p > -5.0, ndtri(jnp.exp(jnp.maximum(log_p, -5.0))), -jnp.sqrt(jnp.maximum(-2.0 * log_p - 2.0, 1.0))
+        log_p > -5.0,
+        ndtri(jnp.exp(jnp.maximum(log_p, -5.0))),
+        -jnp.sqrt(jnp.maximum(-2.0 * log_p - 2.0, 1.0)),
     )
 
     def newton(_, w):
@@ -194,7 +202,9 @@ log_ndtri = cast(Callable[[Array], Array], _log_ndtri)
 
 
 def _past(s: Array, hazard: Array) -> Array:
-    """The u ≥ 0 with −log(1 − I(s, u)/m(s)) = hazard, s ≥ −1: from above, where Newton's method is monotone."""
+    """The u ≥ 0 with −log(1 − I(s, u)/m(s)) = hazard, s ≥ −1: from above, where Newton's method is
+    monotone.
+    """
     m = _mills(s)
     slope = 1 / m
     curvature = jnp.clip(slope * (slope - s), 0.3, 1.0)
@@ -221,7 +231,9 @@ def _truncated(
 
     m, end = _mills(start), start + width
     share = jnp.exp(log_below) * _integral(start, width) / m
-    log_rest = -width * (start + 0.5 * width) + jnp.log(_mills(jnp.where(jnp.isinf(end), 1.0, end)) / m)
+    log_rest = -width * (start + 0.5 * width) + jnp.log(
+        _mills(jnp.where(jnp.isinf(end), 1.0, end)) / m
+    )
     far = -jnp.logaddexp(log_above, log_below + log_rest)
     one_sided = jnp.where(share < 0.5, -jnp.log1p(-jnp.minimum(share, 0.5)), far)
 
@@ -248,10 +260,16 @@ def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]):
     rise, fall = u * (s + 0.5 * u), rest * (s + u + 0.5 * rest)
 
     inside = log_integral(start, width) + rise
-    across = log_probability(jnp.where(tail, -1.0, s), jnp.where(tail, 2.0, d)) + _LOG_SQRT_2PI + 0.5 * w * w
+    across = (
+        log_probability(jnp.where(tail, -1.0, s), jnp.where(tail, 2.0, d))
+        + _LOG_SQRT_2PI
+        + 0.5 * w * w
+    )
     by_z = jnp.exp(jnp.where(tail, inside, across) - 0.5 * z * z - _LOG_SQRT_2PI)
     at_near = jnp.where(
-        rise < 1, jnp.exp(log_above) * jnp.expm1(jnp.minimum(rise, 1.0)), jnp.exp(log_above + rise) - jnp.exp(log_above)
+        rise < 1,
+        jnp.exp(log_above) * jnp.expm1(jnp.minimum(rise, 1.0)),
+        jnp.exp(log_above + rise) - jnp.exp(log_above),
     )
     at_far = jnp.exp(log_below) * jnp.where(half_line, -1.0, jnp.expm1(-fall))
     du = by_z * dz + (at_near + at_far) * ds + _times(jnp.exp(log_below - fall), dd, d)
@@ -269,7 +287,9 @@ def truncated_quantile(
     scale: ArrayLike = 1.0,
     lost: ArrayLike = 0.0,
 ) -> Float[Array, "..."]:
-    """N(mean, scale²) truncated to [lower, upper], at the quantile of z: monotone; mean + scale z without bounds."""
+    """N(mean, scale²) truncated to [lower, upper], at the quantile of z: monotone; mean + scale z
+    without bounds.
+    """
     interval = _mirrored(lower, upper, mean, scale, lost)
     sign, s, d = interval.sign, interval.s, jnp.where(interval.d <= 0, 1.0, interval.d)
     w, u = truncated(sign * z, s, d)
@@ -277,7 +297,8 @@ def truncated_quantile(
     near = jnp.where(jnp.isinf(near), 0.0, near)
     x = jnp.where(_one_sided(s, d)[0], near + sign * scale * u, mean + sign * scale * w)
     x = jnp.where(interval.free, mean + scale * z, x)
-    inside = jax.lax.stop_gradient(jnp.clip(x, lower, upper))  # it repairs rounding, and moves with nothing
+    # it repairs rounding, and moves with nothing
+    inside = jax.lax.stop_gradient(jnp.clip(x, lower, upper))
     return inside + (x - jax.lax.stop_gradient(x))
 
 

@@ -1,8 +1,8 @@
 """All that concerns leading axes of a law.
 
-A law is made of parts, such as an SDE, a start and a match. Each part is shared by the whole batch, or *batched*: all
-its arrays carry the law's own batch axes in front, as `jax.vmap` of a constructor returns them. Plates widen the batch;
-what is written for one datum is mapped over it.
+A law is made of parts, such as an SDE, a start and a match. Each part is shared by the whole batch,
+or *batched*: all its arrays carry the law's own batch axes in front, as `jax.vmap` of a constructor
+returns them. Plates widen the batch; what is written for one datum is mapped over it.
 """
 
 import itertools
@@ -44,7 +44,10 @@ def map_batch(one, shared, own, own_shape, batch_shape, arrays):
 
 def one_of(parts, batched, own_shape, index):
     """The parts of one law of the batch."""
-    index = tuple(i if n > 1 else 0 for i, n in zip(index[len(index) - len(own_shape) :], own_shape, strict=True))
+    index = tuple(
+        i if n > 1 else 0
+        for i, n in zip(index[len(index) - len(own_shape) :], own_shape, strict=True)
+    )
 
     def pick(part):
         return jax.tree.map(lambda a: a[index] if eqx.is_array(a) else a, part)
@@ -53,15 +56,24 @@ def one_of(parts, batched, own_shape, index):
 
 
 def find_batched(parts, batch_shape, declared, check) -> tuple[str, ...]:
-    """Names of the parts that carry the batch axes: as declared, or the one reading that `check` accepts."""
+    """Names of the parts that carry the batch axes: as declared, or the one reading that `check`
+    accepts.
+    """
     carriers = [name for name, part in parts.items() if batch_shape and _carries(part, batch_shape)]
     if declared is not None:
         for name in declared:
-            require(name in parts, f"`batched` must name parts among {sorted(parts)}; got {name!r}.")
-            require(name in carriers, f"every array of `{name}` must have {batch_shape} in front: it is in `batched`.")
+            require(
+                name in parts, f"`batched` must name parts among {sorted(parts)}; got {name!r}."
+            )
+            require(
+                name in carriers,
+                f"every array of `{name}` must have {batch_shape} in front: it is in `batched`.",
+            )
         readings = [tuple(declared)]
     else:
-        readings = [r for k in range(len(carriers), -1, -1) for r in itertools.combinations(carriers, k)]
+        readings = [
+            r for k in range(len(carriers), -1, -1) for r in itertools.combinations(carriers, k)
+        ]
     start = (0,) * len(batch_shape)
     laws = {reading: one_of(parts, reading, batch_shape, start) for reading in readings}
     fitting = [reading for reading, law in laws.items() if len(laws) == 1 or _accepts(check, law)]
@@ -69,8 +81,9 @@ def find_batched(parts, batch_shape, declared, check) -> tuple[str, ...]:
         _explained(check, law, batch_shape)
     require(
         len(fitting) == 1,
-        f"with `batch_shape={batch_shape}`, {' and '.join(carriers)} can be read with and without the batch axes. Say "
-        f"which parts carry them: `batched={fitting[0]}`, or `batched={fitting[-1]}`.",
+        f"with `batch_shape={batch_shape}`, {' and '.join(carriers)} can be read with and without "
+        f"the batch axes. Say which parts carry them: `batched={fitting[0]}`, or "
+        f"`batched={fitting[-1]}`.",
     )
     return fitting[0]
 
@@ -88,8 +101,9 @@ def _explained(check, law, batch_shape):
         check(law)
     except TypeError as e:
         raise ValueError(
-            f"the parts make neither one law nor a batch {batch_shape} of laws: {e} A parameter with an axis of its "
-            "own does it. Laws of a batch are built by `jax.vmap` of the constructors, and declared by `batch_shape`."
+            f"the parts make neither one law nor a batch {batch_shape} of laws: {e} A parameter "
+            "with an axis of its own does it. Laws of a batch are built by `jax.vmap` of the "
+            "constructors, and declared by `batch_shape`."
         ) from e
 
 
@@ -99,7 +113,9 @@ def _carries(part, batch_shape) -> bool:
 
 
 def stacked(part, axes, inner, own):
-    """A part whose arrays have axes of a stack in front, and then the part's own batch axes: both, then `inner`."""
+    """A part whose arrays have axes of a stack in front, and then the part's own batch axes: both,
+    then `inner`.
+    """
 
     def widened(a):
         if not eqx.is_array(a):
@@ -112,13 +128,19 @@ def stacked(part, axes, inner, own):
 
 
 def parameters(part, every=False):
-    """Arrays that may be parameters; `every`: those of a space and of cut points, which are vectors always, too.
+    """Arrays that may be parameters; `every`: those of a space and of cut points, which are vectors
+    always, too.
 
     A guide only leads the path, and its arrays may be of any shape but for those of an SDE.
     """
     if isinstance(part, AbstractGuide):
         nodes = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, AbstractSDE))
-        return [leaf for node in nodes if isinstance(node, AbstractSDE) for leaf in parameters(node, every)]
+        return [
+            leaf
+            for node in nodes
+            if isinstance(node, AbstractSDE)
+            for leaf in parameters(node, every)
+        ]
     vectors = () if every else (AbstractSpace, IntervalCensored)
     leaves = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, vectors))
     return [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
@@ -128,7 +150,10 @@ def as_shape(value, name, smallest=1) -> tuple[int, ...]:
     """A tuple of sizes; `ValueError` for anything else, a number included."""
     good = isinstance(value, Iterable) and not isinstance(value, (str, bytes, dict))
     sizes = tuple(value) if good else ()
-    good = good and all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= smallest for n in sizes)
+    good = good and all(
+        isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= smallest
+        for n in sizes
+    )
     require(good, f"`{name}` must be a tuple of sizes, such as `(3,)`; got {words(value)}.")
     return tuple(int(n) for n in sizes)
 
@@ -144,4 +169,6 @@ def as_datum(value, name):
 def broadcasts(small, large) -> bool:
     """Whether shape `small` broadcasts to shape `large`."""
     padded = (1,) * (len(large) - len(small)) + tuple(small)
-    return len(padded) == len(large) and all(m in (1, n) for m, n in zip(padded, large, strict=True))
+    return len(padded) == len(large) and all(
+        m in (1, n) for m, n in zip(padded, large, strict=True)
+    )

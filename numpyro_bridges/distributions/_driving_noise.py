@@ -15,10 +15,11 @@ _LOG_2PI = 1.8378770664093453
 
 
 class NoiseBlocks(NamedTuple):
-    """How the first axis of the noise of a datum, its rows, is cut into blocks, one after the other.
+    """How the first axis of the noise of a datum, its rows, is cut into blocks, one after the
+    other.
 
-    The log probability is a sum over the blocks, and each term depends on the noise of its own block and of those on
-    the way to it: on no other.
+    The log probability is a sum over the blocks, and each term depends on the noise of its own
+    block and of those on the way to it: on no other.
     """
 
     sizes: tuple[int, ...]
@@ -34,8 +35,9 @@ class MissingNoise(ValueError):
 class DrivingNoise(dist.Distribution):
     """The prior of the driving noise, z ~ N(0, I): `event_shape` is that of the noise of one datum.
 
-    `mask` returns the prior itself. A masked datum says nothing about its noise, which then has its prior as posterior;
-    masked too, the noise would have a constant density, which is improper, and a sampler would follow it to infinity.
+    `mask` returns the prior itself. A masked datum says nothing about its noise, which then has its
+    prior as posterior; masked too, the noise would have a constant density, which is improper, and
+    a sampler would follow it to infinity.
     """
 
     arg_constraints = {}
@@ -75,5 +77,7 @@ class DrivingNoise(dist.Distribution):
 
     def to_event(self, reinterpreted_batch_ndims=None):
         shape = self.batch_shape
-        kept = len(shape) - (len(shape) if reinterpreted_batch_ndims is None else reinterpreted_batch_ndims)
+        kept = len(shape) - (
+            len(shape) if reinterpreted_batch_ndims is None else reinterpreted_batch_ndims
+        )
         return DrivingNoise(shape[:kept], shape[kept:] + self.event_shape)

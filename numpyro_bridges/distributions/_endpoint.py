@@ -1,11 +1,12 @@
 """The law of what is seen of a diffusion at a later time.
 
-`sample` simulates the SDE and observes its end. `log_prob(v)`, with standard normal noise z bound, is the log weight of
-the guided bridge to v, so that
+`sample` simulates the SDE and observes its end. `log_prob(v)`, with standard normal noise z bound,
+is the log weight of the guided bridge to v, so that
 
     E[exp log_prob(v | z)] = p(v | x0),    z ~ N(0, I),
 
-p being the density that `sample` draws from: N(z; 0, I) exp(log_prob(v | z)) is an exact data augmentation.
+p being the density that `sample` draws from: N(z; 0, I) exp(log_prob(v | z)) is an exact data
+augmentation.
 """
 
 from collections.abc import Iterable
@@ -18,7 +19,15 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from .._checks import as_float, concrete, exact_float, require, require_finite, require_instance, words
+from .._checks import (
+    as_float,
+    concrete,
+    exact_float,
+    require,
+    require_finite,
+    require_instance,
+    words,
+)
 from .._types import RealScalar
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractDensityMatch, AbstractMatch
@@ -35,21 +44,24 @@ class DiffusionEndpoint(AbstractNoiseDriven):
 
     - `sde`: an `AbstractSDE`.
     - `x0`: `(n, dim)` or `(n,)`.
-    - `match`: how the end state is seen, an `ExactMatch`, `InexactMatch` or `IntervalCensored`; the datum is `obs=`.
-    - `t1`, `t0`, `num_steps`, `ts`, `guide`: as for `GuidedBridge`. Data with times of their own are a batch: with
-      `batch_shape=(B,)`, `t1` and `t0` may be `(B,)`, and `ts` `(B, K + 1)`.
-    - `batch_shape`: leading axes of a batch of laws with starts or SDEs of their own. Exchangeable data need none: a
-      plate is enough. With `batch_shape=(B,)`, `x0` may be `(B, n, dim)`, and `sde`, `match` and `guide` may be what
-      `jax.vmap` of a constructor returns, every array with the batch axis in front. All else is shared. The law
-      itself may be made by `jax.vmap` too: its batch is then what it was mapped over.
-    - `batched`: names of the parts that carry it, such as `("sde", "x0")`; by default found from the shapes, where they
-      leave no doubt.
+    - `match`: how the end state is seen, an `ExactMatch`, `InexactMatch` or `IntervalCensored`; the
+      datum is `obs=`.
+    - `t1`, `t0`, `num_steps`, `ts`, `guide`: as for `GuidedBridge`. Data with times of their own
+      are a batch: with `batch_shape=(B,)`, `t1` and `t0` may be `(B,)`, and `ts` `(B, K + 1)`.
+    - `batch_shape`: leading axes of a batch of laws with starts or SDEs of their own. Exchangeable
+      data need none: a plate is enough. With `batch_shape=(B,)`, `x0` may be `(B, n, dim)`, and
+      `sde`, `match` and `guide` may be what `jax.vmap` of a constructor returns, every array with
+      the batch axis in front. All else is shared. The law itself may be made by `jax.vmap` too: its
+      batch is then what it was mapped over.
+    - `batched`: names of the parts that carry it, such as `("sde", "x0")`; by default found from
+      the shapes, where they leave no doubt.
 
-    **Shapes:** `event_shape` is that of an observation, `(m, dim)` or `(m,)`. `IntervalCensored` observes numbers of
-    bins, held as floats. The noise of a datum has shape `(num_steps, k, dim)`.
+    **Shapes:** `event_shape` is that of an observation, `(m, dim)` or `(m,)`. `IntervalCensored`
+    observes numbers of bins, held as floats. The noise of a datum has shape `(num_steps, k, dim)`.
 
-    **Errors:** `ValueError` for every other leading axis, for kernels that are no densities (`normalised=False`), for
-    data that are not finite, for more data than noises, and for `log_prob` without noise.
+    **Errors:** `ValueError` for every other leading axis, for kernels that are no densities
+    (`normalised=False`), for data that are not finite, for more data than noises, and for
+    `log_prob` without noise.
     """
 
     def __init__(
@@ -69,8 +81,8 @@ class DiffusionEndpoint(AbstractNoiseDriven):
     ):
         require(
             isinstance(match, AbstractMatch),
-            f"`match` must be a model of observation, such as `InexactMatch(variance)`; got {type(match).__name__}. "
-            "The datum is given to the site, `obs=`.",
+            "`match` must be a model of observation, such as `InexactMatch(variance)`; got "
+            f"{type(match).__name__}. The datum is given to the site, `obs=`.",
         )
         match.check_density()
         x0 = as_float(x0, "x0")
@@ -94,11 +106,15 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         noise_shape = _noise_shape(one, datum)
         declared = batched is not None
         plain = ("ts",) if ts is None else ()
-        super().__init__(parts, names, declared, batch_shape, datum.shape, noise_shape, validate_args, plain)
+        super().__init__(
+            parts, names, declared, batch_shape, datum.shape, noise_shape, validate_args, plain
+        )
 
     @property
     def times(self):
-        """The times of a path, `(num_steps + 1,)`; with the batch axes in front where data have their own."""
+        """The times of a path, `(num_steps + 1,)`; with the batch axes in front where data have
+        their own.
+        """
         ts = self.parts["ts"].ts
         if "ts" not in self._batched:
             return ts
@@ -106,7 +122,8 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         return jnp.broadcast_to(ts.reshape(inner + ts.shape), self._full_shape + ts.shape[-1:])
 
     def path(self, observed):
-        """The bridges to `observed` that the bound noise drives, batch axes and then `(num_steps + 1, n, dim)`.
+        """The bridges to `observed` that the bound noise drives, batch axes and then `(num_steps +
+        1, n, dim)`.
 
         NaN where the law is masked: the datum says nothing of that path, and no bridge leads to it.
         """
@@ -159,9 +176,9 @@ def _grids(times, batch_shape, **settings):
         batch = shape[: len(shape) - len(inner)]
         require(
             batch in ((), batch_shape),
-            f"`{name}` must be {'one grid' if inner else 'one time'}, or one for each law of a batch, "
-            f"{batch_shape + inner} with `batch_shape={batch_shape}`; got shape {shape}. Data with times of their own "
-            f"need `batch_shape={batch}`.",
+            f"`{name}` must be {'one grid' if inner else 'one time'}, or one for each law of a "
+            f"batch, {batch_shape + inner} with `batch_shape={batch_shape}`; got shape {shape}. "
+            f"Data with times of their own need `batch_shape={batch}`.",
         )
         (own if batch else shared)[name] = value
     if not own:
@@ -186,11 +203,15 @@ def _grids(times, batch_shape, **settings):
 
 def _bridge(parts, value) -> GuidedBridge:
     condition = parts["match"].at(value)
-    return GuidedBridge(parts["sde"], condition, x0=parts["x0"], ts=parts["ts"], guide=parts["guide"])
+    return GuidedBridge(
+        parts["sde"], condition, x0=parts["x0"], ts=parts["ts"], guide=parts["guide"]
+    )
 
 
 def close_parts(parts, one, names, num_axes, ts, several=()) -> None:
-    """Freezes what users' functions read, for one law and for the batch; `several`: parts of which a law has many."""
+    """Freezes what users' functions read, for one law and for the batch; `several`: parts of which
+    a law has many.
+    """
 
     def set_closed(name, close):
         one[name] = close(one[name])
@@ -239,7 +260,8 @@ def seen_shape(parts) -> tuple[int, ...]:
         sde = parts["sde"]
         return parts["match"].example(sde, sde.transition(t0, t1, x0).mean)
 
-    time = jax.ShapeDtypeStruct((), parts["x0"].dtype)  # no number: a coefficient may be defined on [t0, t1] only
+    # no number: a coefficient may be defined on [t0, t1] only
+    time = jax.ShapeDtypeStruct((), parts["x0"].dtype)
     return jax.eval_shape(seen, time, time, parts["x0"]).shape
 
 
@@ -248,7 +270,8 @@ def check_law(parts):
     x0 = parts["x0"]
     require(
         x0.ndim in (1, 2),
-        f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Declare a batch of starts by `batch_shape`.",
+        f"`x0` must be one state, (n, dim) or (n,); got shape {x0.shape}. Declare a batch of "
+        "starts by `batch_shape`.",
     )
     parts["sde"].check_state(x0)
     seen_shape(parts)

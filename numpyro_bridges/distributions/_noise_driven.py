@@ -1,4 +1,6 @@
-"""A NumPyro distribution of an observation whose density is that of a bridge, given standard normal noise."""
+"""A NumPyro distribution of an observation whose density is that of a bridge, given standard normal
+noise.
+"""
 
 import copy
 import math
@@ -18,11 +20,14 @@ from ._driving_noise import DrivingNoise, NoiseBlocks
 
 
 class AbstractNoiseDriven(dist.Distribution):
-    """The law of an observation. Its density given standard normal noise averages over the noise to that of `sample`.
+    """The law of an observation. Its density given standard normal noise averages over the noise to
+    that of `sample`.
 
-    A subclass says, for the parts of one law, how to simulate, how to weigh and what a datum must be.
+    A subclass says, for the parts of one law, how to simulate, how to weigh and what a datum must
+    be.
 
-    What `jax.vmap` and `lax.scan` stack into one law is a batch of laws, their axes in front of its own.
+    What `jax.vmap` and `lax.scan` stack into one law is a batch of laws, their axes in front of its
+    own.
     """
 
     arg_constraints = {}
@@ -42,9 +47,11 @@ class AbstractNoiseDriven(dist.Distribution):
         plain=(),
     ):
         self.parts, self.noise, self._mask = parts, None, None
-        self._stack = np.zeros(())  # gets the axes that a transformation puts in front of all arrays
+        # gets the axes that a transformation puts in front of all arrays
+        self._stack = np.zeros(())
         self._batched, self._declared = batched, declared
-        self._plain = plain  # parts made of scalars, which no parameter of a datum can have broadcast
+        # parts made of scalars, which no parameter of a datum can have broadcast
+        self._plain = plain
         self._own_shape, self._noise_shape, self._moved = batch_shape, noise_shape, 0
         super().__init__(batch_shape, event_shape, validate_args=validate_args)
         self.refuse_hidden_axes(batch_shape, names=("sde", "match"))
@@ -104,12 +111,16 @@ class AbstractNoiseDriven(dist.Distribution):
 
     @staticmethod
     def _check_data(parts, values):
-        """`ValueError` if one of the values, a leading axis of them, cannot be observed, by its match alone."""
+        """`ValueError` if one of the values, a leading axis of them, cannot be observed, by its
+        match alone.
+        """
         raise NotImplementedError
 
     @property
     def has_rsample(self):
-        """`False`: what asks for it is a variational guide, and a law whose density needs the noise cannot be one."""
+        """`False`: what asks for it is a variational guide, and a law whose density needs the noise
+        cannot be one.
+        """
         return False
 
     @property
@@ -126,44 +137,56 @@ class AbstractNoiseDriven(dist.Distribution):
         return None
 
     def given(self, noise):
-        """The same law with its noise bound, so that it has a `log_prob`. Leading axes of the noise widen the batch."""
+        """The same law with its noise bound, so that it has a `log_prob`. Leading axes of the noise
+        widen the batch.
+        """
         event = self.event_shape[: self._moved] + self._noise_shape
         noise = floating(noise, "noise")
         k = noise.ndim - len(event)
         require(
             k >= 0 and noise.shape[k:] == event,
-            f"`noise` must have shape (..., {', '.join(map(str, event))}), one for each datum; got {noise.shape}.",
+            f"`noise` must have shape (..., {', '.join(map(str, event))}), one for each datum; got "
+            f"{noise.shape}.",
         )
         require(
             broadcasts(self.batch_shape, noise.shape[:k]),
-            f"`noise` must have one noise for each datum, batch shape {self.batch_shape}; got {noise.shape[:k]}. "
-            "Draw it from `law.noise_prior()`, inside the same plates as the data.",
+            f"`noise` must have one noise for each datum, batch shape {self.batch_shape}; got "
+            f"{noise.shape[:k]}. Draw it from `law.noise_prior()`, inside the same plates as the "
+            "data.",
         )
         return (
-            self._replace(noise=None)._widened(noise.shape[: noise.ndim - len(self._noise_shape)])._replace(noise=noise)
+            self._replace(noise=None)
+            ._widened(noise.shape[: noise.ndim - len(self._noise_shape)])
+            ._replace(noise=noise)
         )
 
     def sample(self, key, sample_shape=()):
-        """Observations of the unconditioned process. The bound noise, which belongs to a datum, plays no part."""
+        """Observations of the unconditioned process. The bound noise, which belongs to a datum,
+        plays no part.
+        """
         return self._over_batch(self._observe, *self._keys(key, sample_shape))
 
     def sample_with_noise(self, key, sample_shape=()):
-        """Joint draws (v, z): with v from `sample`, z the noise by which the bridge to v retraces the simulated path.
+        """Joint draws (v, z): with v from `sample`, z the noise by which the bridge to v retraces
+        the simulated path.
 
-        They have density `exp(noise_prior().log_prob(z) + given(z).log_prob(v))`. To draw z from its prior and then v
-        gives the same margins and the wrong joint law.
+        They have density `exp(noise_prior().log_prob(z) + given(z).log_prob(v))`. To draw z from
+        its prior and then v gives the same margins and the wrong joint law.
         """
         return self._over_batch(self._simulate, *self._keys(key, sample_shape))
 
     def log_prob(self, value, intermediates=None):
         """log p(value | noise). Its exponential averages over the noise to the density of `sample`.
 
-        It is no density of `value` at fixed noise. Where the law is masked it is 0, whatever the value, NaN included.
+        It is no density of `value` at fixed noise. Where the law is masked it is 0, whatever the
+        value, NaN included.
         """
         return self._log_prob_by(self._log_weight, (), value)
 
     def _log_prob_by_block(self, value):
-        """Terms of `log_prob`, an axis of `noise_blocks` behind those of the batch; their sum is `log_prob`."""
+        """Terms of `log_prob`, an axis of `noise_blocks` behind those of the batch; their sum is
+        `log_prob`.
+        """
         blocks = self.noise_blocks
         assert blocks is not None
         return self._log_prob_by(self._log_weights, (len(blocks.above),), value)
@@ -174,8 +197,9 @@ class AbstractNoiseDriven(dist.Distribution):
         self._check_value(value, "value")
         require(
             self.noise is not None,
-            f"the noise site is missing: {type(self).__name__} has a density only with its noise bound. Use "
-            "`numpyro_bridges.sample(name, law, obs=...)`, the handler `NoiseReparam`, or `law.given(noise)`.",
+            f"the noise site is missing: {type(self).__name__} has a density only with its noise "
+            "bound. Use `numpyro_bridges.sample(name, law, obs=...)`, the handler `NoiseReparam`, "
+            "or `law.given(noise)`.",
         )
         full, mask = self._full_shape, self._mask
         if mask is not None and not np.any(concrete(mask) if concrete(mask) is not None else True):
@@ -199,7 +223,11 @@ class AbstractNoiseDriven(dist.Distribution):
         path = self._over_batch(one, self._full_shape, observed, self.noise)
         if self._mask is None:
             return path
-        return jnp.where(self._mask.reshape(self._full_shape + (1,) * (path.ndim - self._mask.ndim)), path, jnp.nan)
+        return jnp.where(
+            self._mask.reshape(self._full_shape + (1,) * (path.ndim - self._mask.ndim)),
+            path,
+            jnp.nan,
+        )
 
     def expand(self, batch_shape):
         return self._widened(as_shape(batch_shape, "batch_shape") + self.event_shape[: self._moved])
@@ -209,7 +237,9 @@ class AbstractNoiseDriven(dist.Distribution):
             return self
         known = mask if isinstance(mask, jax.Array) else np.asarray(mask)
         booleans = known.dtype == np.bool_
-        require(booleans, f"`mask` must hold booleans, True where a datum counts; got {words(mask)}.")
+        require(
+            booleans, f"`mask` must hold booleans, True where a datum counts; got {words(mask)}."
+        )
         mask = jnp.asarray(known)
         law = self.expand(jnp.broadcast_shapes(mask.shape, self.batch_shape))
         mask = jnp.broadcast_to(mask, law.batch_shape)
@@ -222,10 +252,13 @@ class AbstractNoiseDriven(dist.Distribution):
         good = isinstance(k, (int, np.integer)) and 0 <= k <= n
         require(
             good,
-            f"`reinterpreted_batch_ndims` must be a number from 0 to {n}, the number of batch axes; got {words(k)}.",
+            f"`reinterpreted_batch_ndims` must be a number from 0 to {n}, the number of batch "
+            f"axes; got {words(k)}.",
         )
         batch, moved = self.batch_shape[: n - k], self.batch_shape[n - k :]
-        return self._replace(_batch_shape=batch, _event_shape=moved + self.event_shape, _moved=self._moved + k)
+        return self._replace(
+            _batch_shape=batch, _event_shape=moved + self.event_shape, _moved=self._moved + k
+        )
 
     def _replace(self, **fields):
         law = copy.copy(self)
@@ -249,9 +282,9 @@ class AbstractNoiseDriven(dist.Distribution):
         if noise is not None:
             require(
                 math.prod(old) == math.prod(full),
-                f"the law has {math.prod(old)} noise(s), batch shape {old}, and is expanded to {full}. One noise "
-                "shared by several data is a wrong likelihood: draw it inside the same plates, or use "
-                "`numpyro_bridges.sample`.",
+                f"the law has {math.prod(old)} noise(s), batch shape {old}, and is expanded to "
+                f"{full}. One noise shared by several data is a wrong likelihood: draw it inside "
+                "the same plates, or use `numpyro_bridges.sample`.",
             )
             noise = noise.reshape(full + self._noise_shape)
         mask = mask if mask is None else jnp.broadcast_to(mask, full)
@@ -260,9 +293,9 @@ class AbstractNoiseDriven(dist.Distribution):
     def refuse_hidden_axes(self, batch, drawn="", names=None) -> None:
         """`ValueError` where a shared part has an axis as long as one of the batch.
 
-        It may be a parameter of each datum, which would be broadcast into the state. The SDE and the match are refused
-        on sight. A start, a grid or a space has axes of its own always, and is refused where a site, `drawn`, shows
-        that there are parameters of each datum.
+        It may be a parameter of each datum, which would be broadcast into the state. The SDE and
+        the match are refused on sight. A start, a grid or a space has axes of its own always, and
+        is refused where a site, `drawn`, shows that there are parameters of each datum.
         """
         if self._declared:
             return
@@ -272,10 +305,11 @@ class AbstractNoiseDriven(dist.Distribution):
             for leaf in parameters(part, every=names is None):
                 require(
                     sizes.isdisjoint(leaf.shape),
-                    f"`{name}` holds an array of shape {leaf.shape} and is used in a batch {tuple(batch)}"
-                    f"{drawn and f', in which `{drawn}` is drawn'}. A parameter drawn inside the plate would be "
-                    f"broadcast into the state: build one `{name}` for each datum by `jax.vmap`, and give "
-                    f"`batch_shape`. If the array belongs to every datum, say `batched={self._batched}`.",
+                    f"`{name}` holds an array of shape {leaf.shape} and is used in a batch "
+                    f"{tuple(batch)}{drawn and f', in which `{drawn}` is drawn'}. A parameter "
+                    "drawn inside the plate would be broadcast into the state: build one "
+                    f"`{name}` for each datum by `jax.vmap`, and give `batch_shape`. If the array "
+                    f"belongs to every datum, say `batched={self._batched}`.",
                 )
 
     def _keys(self, key, sample_shape):
@@ -284,7 +318,7 @@ class AbstractNoiseDriven(dist.Distribution):
         return shape, jr.split(key, shape)
 
     def _over_batch(self, one, batch_shape, *arrays):
-        """`one(parts, *items)` for every item of the batch, results with the batch axes in front."""
+        """`one(parts, *items)` of every item of the batch, results with the batch axes in front"""
         own = {name: self.parts[name] for name in self._batched}
         shared = {name: part for name, part in self.parts.items() if name not in own}
         return map_batch(one, shared, own, self._own_shape, batch_shape, arrays)
@@ -294,14 +328,14 @@ class AbstractNoiseDriven(dist.Distribution):
         k = len(shape) - self.event_dim
         require(
             k >= 0 and shape[k:] == self.event_shape,
-            f"`{name}`, an observation, must have shape {self.event_shape}, behind a batch {self.batch_shape}; got "
-            f"{shape}.",
+            f"`{name}`, an observation, must have shape {self.event_shape}, behind a batch "
+            f"{self.batch_shape}; got {shape}.",
         )
         require(
             broadcasts(shape[:k], self.batch_shape),
-            f"`{name}` holds {math.prod(shape[:k])} observations, batch shape {shape[:k]}, for a law of batch "
-            f"{self.batch_shape}. One noise shared by several data is a wrong likelihood: put the site into a "
-            "`numpyro.plate`.",
+            f"`{name}` holds {math.prod(shape[:k])} observations, batch shape {shape[:k]}, for a "
+            f"law of batch {self.batch_shape}. One noise shared by several data is a wrong "
+            "likelihood: put the site into a `numpyro.plate`.",
         )
         data, mask = concrete(value), True if self._mask is None else concrete(self._mask)
         if data is not None and mask is not None:
@@ -311,7 +345,9 @@ class AbstractNoiseDriven(dist.Distribution):
                 self._check_seen(data, np.broadcast_to(mask, full))
 
     def _check_seen(self, data, seen):
-        """All data at once; one after the other to name the one that is wrong, or where each has its own match."""
+        """All data at once; one after the other to name the one that is wrong, or where each has
+        its own match.
+        """
         batched = tuple({"match"} & set(self._batched))
         match = {name: self.parts[name] for name in ("match", "settings") if name in self.parts}
         if not seen.any() or not batched and _passes(self._check_data, match, data[seen]):

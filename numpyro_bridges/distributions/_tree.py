@@ -1,7 +1,8 @@
 """The law of what is seen of a diffusion along the branches of a tree.
 
-`sample` simulates from the root and observes the nodes that are seen. `log_prob(v)`, with standard normal noise z
-bound, is the log weight Ψ of guided paths along all branches (`trees/_sweep.py`), so that
+`sample` simulates from the root and observes the nodes that are seen. `log_prob(v)`, with standard
+normal noise z bound, is the log weight Ψ of guided paths along all branches (`trees/_sweep.py`), so
+that
 
     E[exp log_prob(v | z)] = p(v | x0),    z ~ N(0, I).
 
@@ -51,7 +52,9 @@ class _Settings(eqx.Module):
 
     @property
     def steps_together(self) -> int:
-        """Steps that every branch has, or every piece of it: a branch with more is a chain of branches."""
+        """Steps that every branch has, or every piece of it: a branch with more is a chain of
+        branches.
+        """
         return int(np.gcd.reduce(self.num_steps))
 
     @property
@@ -66,37 +69,42 @@ class DiffusionTree(AbstractNoiseDriven):
         law = DiffusionTree(flow, x0, InexactMatch(1e-4), tree=tree, num_steps=10)
         nb.sample("tips", law, obs=tree.rows(shapes))
 
-    Daughters of a node start where their mother ended and go their own ways; what is not seen says nothing and costs
-    nothing.
+    Daughters of a node start where their mother ended and go their own ways; what is not seen says
+    nothing and costs nothing.
 
     **Arguments:**
 
-    - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths; or one for each branch with
-      `per_edge=("sde",)`, every array with an axis `(num_nodes - 1,)` in front, in the order of `tree.lengths`, as
-      `jax.vmap` of a constructor returns it. They have one space.
-    - `x0`: the state at the root, `(n, dim)` or `(n,)`; with a `root_covariance` the mean of its prior.
-    - `root_covariance`: C of the prior N(x0, C) of the state at the root, `()`, `(n,)` (a diagonal) or `(n, n)`, acting
-      on each coordinate column; left out, the root is at x0. It is marginalised, exactly where the SDE is linear.
-    - `match`: how a node is seen, the same for all, or one for each row of data with `per_row=("match",)`: every array
-      with an axis `(m,)` in front, as `jax.vmap` of a constructor returns it. So each row has an error of its own, or
-      its own `mask` of an `InexactMatch`. Rows of one node are independent given its state: the variance of the match
-      is then the variation within species.
+    - `sde`: an `AbstractSDE`, in the units of time of the tree's lengths; or one for each branch
+      with `per_edge=("sde",)`, every array with an axis `(num_nodes - 1,)` in front, in the order
+      of `tree.lengths`, as `jax.vmap` of a constructor returns it. They have one space.
+    - `x0`: the state at the root, `(n, dim)` or `(n,)`; with a `root_covariance` the mean of its
+      prior.
+    - `root_covariance`: C of the prior N(x0, C) of the state at the root, `()`, `(n,)` (a diagonal)
+      or `(n, n)`, acting on each coordinate column; left out, the root is at x0. It is
+      marginalised, exactly where the SDE is linear.
+    - `match`: how a node is seen, the same for all, or one for each row of data with
+      `per_row=("match",)`: every array with an axis `(m,)` in front, as `jax.vmap` of a constructor
+      returns it. So each row has an error of its own, or its own `mask` of an `InexactMatch`. Rows
+      of one node are independent given its state: the variance of the match is then the variation
+      within species.
     - `tree`: a `Tree`. Its lengths may be parameters.
-    - `num_steps`: steps on each branch, one number, or `(num_nodes - 1,)` of them in the order of `tree.lengths`:
-      `tree.num_steps(longest)` counts those that are in proportion to the lengths. 1 unless given where the SDE has its
-      exact transition (`LinearSDE`, `BrownianMotion`).
+    - `num_steps`: steps on each branch, one number, or `(num_nodes - 1,)` of them in the order of
+      `tree.lengths`: `tree.num_steps(longest)` counts those that are in proportion to the lengths.
+      1 unless given where the SDE has its exact transition (`LinearSDE`, `BrownianMotion`).
     - `t0`: the time at the root.
     - `guide`: as for `GuidedBridge`, for every branch.
     - `batch_shape`, `batched`: several trees with parts of their own, as for `DiffusionEndpoint`.
 
-    **Shapes:** `event_shape` is `(m, ...)`, one observation for each entry of `tree.observed`; data come in that order
-    by `tree.rows`. The noise has shape `(rows, k, dim)`, a row for each step, branches in preorder, those alone that
-    lead to something seen. With a prior of the root ⌈n / k⌉ rows are in front.
+    **Shapes:** `event_shape` is `(m, ...)`, one observation for each entry of `tree.observed`; data
+    come in that order by `tree.rows`. The noise has shape `(rows, k, dim)`, a row for each step,
+    branches in preorder, those alone that lead to something seen. With a prior of the root ⌈n / k⌉
+    rows are in front.
 
-    For a linear SDE with the default guide the density does not depend on the noise: it is the likelihood.
+    For a linear SDE with the default guide the density does not depend on the noise: it is the
+    likelihood.
 
-    **Errors:** `ValueError` as for `DiffusionEndpoint`, for `IntervalCensored`, for an exact match of an inner node
-    or of a node with several rows, and for a seen root that has no prior.
+    **Errors:** `ValueError` as for `DiffusionEndpoint`, for `IntervalCensored`, for an exact match
+    of an inner node or of a node with several rows, and for a seen root that has no prior.
     """
 
     def __init__(
@@ -116,7 +124,12 @@ class DiffusionTree(AbstractNoiseDriven):
         batched: tuple[str, ...] | None = None,
         validate_args: bool | None = None,
     ):
-        require_instance(match, AbstractMatch, "match", "a model of observation, such as `InexactMatch(variance)`")
+        require_instance(
+            match,
+            AbstractMatch,
+            "match",
+            "a model of observation, such as `InexactMatch(variance)`",
+        )
         match.check_density()
         x0 = as_float(x0, "x0")
         require_finite(x0, "x0")
@@ -126,11 +139,16 @@ class DiffusionTree(AbstractNoiseDriven):
             require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
         require(
             root_covariance is not None or 0 not in tree.observed,
-            "`tree` must not have its root among the seen nodes: `x0` is where it is. Give it a prior by "
-            "`root_covariance`.",
+            "`tree` must not have its root among the seen nodes: `x0` is where it is. Give it a "
+            "prior by `root_covariance`.",
         )
-        require(any(tree.observed), "`tree` must have a seen node besides its root, which no branch leads to.")
-        prior = None if root_covariance is None else as_covariance(root_covariance, "root_covariance")
+        require(
+            any(tree.observed),
+            "`tree` must have a seen node besides its root, which no branch leads to.",
+        )
+        prior = (
+            None if root_covariance is None else as_covariance(root_covariance, "root_covariance")
+        )
         own, own_edges = names_of(per_row) or (), names_of(per_edge) or ()
         require(set(own) <= {"match"}, f"`per_row` may hold 'match'; got {per_row}.")
         require(set(own_edges) <= {"sde"}, f"`per_edge` may hold 'sde'; got {per_edge}.")
@@ -143,7 +161,15 @@ class DiffusionTree(AbstractNoiseDriven):
         declared = names_of(batched)
         start = as_float(t0, "t0")
         require(start.ndim == 0, f"`t0` must be one time; got shape {start.shape}.")
-        parts = {"sde": sde, "x0": x0, "match": match, "guide": guide, "tree": tree, "t0": start, "settings": settings}
+        parts = {
+            "sde": sde,
+            "x0": x0,
+            "match": match,
+            "guide": guide,
+            "tree": tree,
+            "t0": start,
+            "settings": settings,
+        }
         parts["root_covariance"] = prior
         names = find_batched(parts, batch_shape, declared, _check)
         one = _simplest(one_of(parts, names, batch_shape, (0,) * len(batch_shape)))
@@ -156,7 +182,14 @@ class DiffusionTree(AbstractNoiseDriven):
         k = one["sde"].noise_size(one["x0"])
         noise_shape = (_root(one).num_rows(k) + num_steps_in_all, k, columns)
         super().__init__(
-            parts, names, declared is not None, batch_shape, datum.shape, noise_shape, validate_args, ("t0",)
+            parts,
+            names,
+            declared is not None,
+            batch_shape,
+            datum.shape,
+            noise_shape,
+            validate_args,
+            ("t0",),
         )
 
     @property
@@ -178,7 +211,8 @@ class DiffusionTree(AbstractNoiseDriven):
 
     @property
     def times(self):
-        """The times of `path`, `(branches, num_steps + 1)`, NaN behind the end of branches with fewer steps.
+        """The times of `path`, `(branches, num_steps + 1)`, NaN behind the end of branches with
+        fewer steps.
 
         With the batch axes in front where trees have their own.
         """
@@ -187,34 +221,41 @@ class DiffusionTree(AbstractNoiseDriven):
         return self._over_batch(_times, self._full_shape)
 
     def log_prob_by_node(self, observed):
-        """For each seen node a log likelihood of what is seen there, `(m,)` behind a batch, for leave-one-out.
+        """For each seen node a log likelihood of what is seen there, `(m,)` behind a batch, for
+        leave-one-out.
 
-        With S the states that a tip s does not lead to, z_s the noise of its branch and ψ_s the branch's term of
-        `log_prob`, the joint density of parameters, states, noise and data is
+        With S the states that a tip s does not lead to, z_s the noise of its branch and ψ_s the
+        branch's term of `log_prob`, the joint density of parameters, states, noise and data is
 
-            p(θ, S, other data) N(z_s; 0, I) exp ψ_s(z_s, S),    ∫ N(z_s; 0, I) exp ψ_s dz_s = p(v_s | S, θ),
+            p(θ, S, other data) N(z_s; 0, I) exp ψ_s(z_s, S),    ∫ N(z_s; 0, I) exp ψ_s dz_s = p(v_s
+            | S, θ),
 
-        whatever the guide made of the noise of other branches, since they enter by their states. So the posterior mean
-        of exp(-ψ_s) is 1 / p(v_s | all other data): ψ_s is what leave-one-out asks for, and log p(v_s | S, θ) itself
-        for a linear SDE. The density given the state at the tip, log p(v_s | x_s), has the same mean, and its inverse
-        an infinite variance where the error is small beside the branch; only what is seen of a node that leads to
-        others has that, since all below depends on the state.
+        whatever the guide made of the noise of other branches, since they enter by their states. So
+        the posterior mean of exp(-ψ_s) is 1 / p(v_s | all other data): ψ_s is what leave-one-out
+        asks for, and log p(v_s | S, θ) itself for a linear SDE. The density given the state at the
+        tip, log p(v_s | x_s), has the same mean, and its inverse an infinite variance where the
+        error is small beside the branch; only what is seen of a node that leads to others has that,
+        since all below depends on the state.
         """
         return self._log_prob_by(_by_node, (len(set(self.tree.observed)),), observed)
 
     def path(self, observed):
-        """Paths to `observed` that the bound noise drives, batch axes and then `(branches, num_steps + 1, n, dim)`.
+        """Paths to `observed` that the bound noise drives, batch axes and then `(branches,
+        num_steps + 1, n, dim)`.
 
-        Branches in preorder, those that lead to something seen; the first state of each is the last of its parent's.
-        NaN behind the end of a branch with fewer steps than others, and where the law is masked.
+        Branches in preorder, those that lead to something seen; the first state of each is the last
+        of its parent's. NaN behind the end of a branch with fewer steps than others, and where the
+        law is masked.
         """
         return self._paths_to(observed, _paths)
 
     def nodes(self, observed):
-        """States of all nodes of the tree, given `observed` and the bound noise: ancestors among them.
+        """States of all nodes of the tree, given `observed` and the bound noise: ancestors among
+        them.
 
-        Batch axes and then `(num_nodes, n, dim)`, `(num_nodes, n)` for vector states, in the order of `tree.names`: the
-        root first, node i at i. Nodes that lead to nothing seen have no noise and are NaN, all where the law is masked.
+        Batch axes and then `(num_nodes, n, dim)`, `(num_nodes, n)` for vector states, in the order
+        of `tree.names`: the root first, node i at i. Nodes that lead to nothing seen have no noise
+        and are NaN, all where the law is masked.
         """
         return self._paths_to(observed, _nodes)
 
@@ -267,7 +308,7 @@ def _counts(num_steps, tree: Tree) -> tuple[int, ...]:
 
 
 def _examples(parts) -> Array:
-    """Data for what is known before there are any; `parts` of the law of one node and one branch."""
+    """Data for what is known before there are any; `parts` of the law of a node and a branch."""
     one = example(parts)
     return jnp.broadcast_to(one, (len(parts["tree"].observed), *one.shape))
 
@@ -290,12 +331,16 @@ def _check(parts):
     for name in settings.per_edge:
         _check_axis(parts[name], tree.num_nodes - 1, f"`{name}` is in `per_edge`", "branch")
         for value in map(concrete, jax.tree.leaves(parts[name].space)):
-            require(value is None or np.all(value == value[:1]), f"`{name}` must have one space on all branches.")
+            require(
+                value is None or np.all(value == value[:1]),
+                f"`{name}` must have one space on all branches.",
+            )
     check_law(_simplest(parts))
     prior, n = parts["root_covariance"], parts["x0"].shape[0]
     require(
         prior is None or prior.ndim == 0 or prior.shape[0] == n,
-        f"`root_covariance` must be a number, ({n},) or ({n}, {n}), as the state has {n} rows; got {words(prior)}.",
+        f"`root_covariance` must be a number, ({n},) or ({n}, {n}), as the state has {n} rows; got "
+        f"{words(prior)}.",
     )
 
 
@@ -305,8 +350,8 @@ def _check_axis(part, size, why, what):
     for leaf in leaves:
         require(
             leaf.ndim > 0 and leaf.shape[0] == size,
-            f"{why}, so every array of it must have {size} rows, one for each {what}; got shape {leaf.shape}. Build it "
-            "by `jax.vmap`.",
+            f"{why}, so every array of it must have {size} rows, one for each {what}; got shape "
+            f"{leaf.shape}. Build it by `jax.vmap`.",
         )
 
 
@@ -314,21 +359,22 @@ def _check_condition(parts, datum):
     tree, condition = parts["tree"], parts["match"].at(datum[0])
     require(
         condition.num_extra_noises == 0 or condition.is_approximated,
-        "`match` must see a value at each node, such as `InexactMatch(variance)`: branches are not led to sets.",
+        "`match` must see a value at each node, such as `InexactMatch(variance)`: branches are not "
+        "led to sets.",
     )
     if not (condition.exact or condition.is_approximated):
         return
     twice = len(tree.observed) - len(set(tree.observed))
     require(
         not twice,
-        f"`match` must have a Gaussian error where nodes have several rows, and {twice} rows are of nodes that have "
-        "one already: use an `InexactMatch`, of the variance within species.",
+        f"`match` must have a Gaussian error where nodes have several rows, and {twice} rows are "
+        "of nodes that have one already: use an `InexactMatch`, of the variance within species.",
     )
     inner = [node for node in tree.observed if node not in tree.tips]
     require(
         not (condition.exact and inner),
-        f"`match` must have an error where inner nodes are seen, and {len(inner)} of the seen nodes are no tips: use "
-        "an `InexactMatch` of a small variance.",
+        f"`match` must have an error where inner nodes are seen, and {len(inner)} of the seen "
+        "nodes are no tips: use an `InexactMatch` of a small variance.",
     )
 
 
@@ -349,7 +395,9 @@ def _unled(parts, value) -> TreeProblem:
     if max(sizes) > 1:
         conditions = fused(match, value, sizes, own, sde, x0)
     else:
-        conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(match, value)
+        conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(
+            match, value
+        )
     if conditions.is_approximated:
         conditions = _anchored(parts, sde, tree, conditions)
     guide, root = parts["guide"], _root(parts)
@@ -364,11 +412,15 @@ def _unled(parts, value) -> TreeProblem:
 
 
 def _anchored(parts, sde: AbstractSDE, tree: Tree, conditions):
-    """Conditions with the observations that paths are led by: near where a Brownian motion would be at each node."""
+    """Conditions with the observations that paths are led by: near where a Brownian motion would be
+    at each node.
+    """
     x0, prior = parts["x0"], parts["root_covariance"]
     n = x0.shape[0]
     a = promote(sde.covariance(parts["t0"], x0), 2, n)
-    at_root = jnp.zeros_like(a) if prior is None else promote(symmetric(prior).astype(x0.dtype), 2, n)
+    at_root = (
+        jnp.zeros_like(a) if prior is None else promote(symmetric(prior).astype(x0.dtype), 2, n)
+    )
 
     def anchored(condition, depth):
         return condition.anchored(sde, lambda: (x0, at_root + depth * a))
@@ -394,7 +446,9 @@ def _divided(parts) -> Tree:
 
 
 def _along(parts, by_piece):
-    """What is known at the states of all pieces, `(pieces, steps together + 1, ...)`, for each branch as a whole."""
+    """What is known at the states of all pieces, `(pieces, steps together + 1, ...)`, for each
+    branch as a whole.
+    """
     settings, active = parts["settings"], np.array(parts["tree"].active)
     together = settings.steps_together
     counts, pieces = np.array(settings.num_steps)[active - 1], settings.pieces[active - 1]
@@ -453,5 +507,8 @@ def _simulated(parts, key):
     ends = _unflat(parts, problem.at_nodes(paths)[np.array(tree.observed)])
     sde = parts["sde"] if "sde" not in parts["settings"].per_edge else _first(parts["sde"])
     keys = jr.split(key_seen, len(ends))
-    draw = jax.vmap(lambda match, key, x: match.sample(key, sde, x), in_axes=(0 if "match" in own else None, 0, 0))
+    draw = jax.vmap(
+        lambda match, key, x: match.sample(key, sde, x),
+        in_axes=(0 if "match" in own else None, 0, 0),
+    )
     return draw(match, keys, ends), paths

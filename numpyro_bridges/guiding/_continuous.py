@@ -1,10 +1,12 @@
 """The guided SDE in continuous time, for any Itô diffrax solver.
 
-dX° = (b + a ∇log h̃) dt + σ dW with h̃ of one linear auxiliary process, and beside it the log weight
+dX° = (b + a ∇log h̃) dt + σ dW with h̃ of one linear auxiliary process, and beside it the log
+weight
 
     log h̃(t0, x0) + ∫ G dt,    G = (b − b̃)ᵀ r̃ − ½ tr[(a − ã)(H − r̃ r̃ᵀ)]:
 
-consistent as dt → 0, biased at fixed dt, unbounded where dt · a · H is not small (Schauer et al. 2017).
+consistent as dt → 0, biased at fixed dt, unbounded where dt · a · H is not small (Schauer et al.
+2017).
 """
 
 from collections.abc import Callable
@@ -14,7 +16,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import add, apply, columns, congruence, promote, semidefinite_cholesky, solve_lower, varying_like
+from .._linalg import (
+    add,
+    apply,
+    columns,
+    congruence,
+    promote,
+    semidefinite_cholesky,
+    solve_lower,
+    varying_like,
+)
 from .._types import RealScalar, State
 from ..conditioning import GaussianMessage, Observation
 from ..sdes import AbstractSDE, LinearSDE
@@ -39,12 +50,18 @@ class _JointNoise(diffrax.AbstractTerm):
         return dx, jnp.zeros((), dx.dtype)
 
 
-def exact_message(auxiliary: LinearSDE, seen: Observation, t, t1, x: State, observed: State) -> GaussianMessage:
+def exact_message(
+    auxiliary: LinearSDE, seen: Observation, t, t1, x: State, observed: State
+) -> GaussianMessage:
     """h̃(t, ·) of a linear process in continuous time."""
     step = auxiliary.exact_step(t, t1, x)
     operator, n = seen.operator, x.shape[0]
     M = add(congruence(operator, step.covariance), seen.covariance)
-    flow = step.operator if operator.ndim == 0 else promote(operator, 2, n) @ promote(step.operator, 2, n)
+    flow = (
+        step.operator
+        if operator.ndim == 0
+        else promote(operator, 2, n) @ promote(step.operator, 2, n)
+    )
     shift = apply(operator, step.shift)
     return GaussianMessage(flow, shift, semidefinite_cholesky(M), observed, seen.log_scale)
 
@@ -72,7 +89,9 @@ def continuous_terms(
     """Terms of the guided SDE, with ∫ G dt as a second component of the solution."""
 
     def field(t, y, args):
-        return weight_rate(sde, auxiliary, exact_message(auxiliary, seen, t, t1, y[0], observed), t, y[0])
+        return weight_rate(
+            sde, auxiliary, exact_message(auxiliary, seen, t, t1, y[0], observed), t, y[0]
+        )
 
     return diffrax.MultiTerm(diffrax.ODETerm(field), _JointNoise(sde.diffusion, control))
 
@@ -94,7 +113,9 @@ def travel_continuous(
     noise: Float[Array, "K k *dim"],
     observed: State,
 ) -> tuple[Float[Array, "K n *dim"], Float[Array, ""]]:
-    """The states after x0 and the continuous log weight. An exactly observed end is pinned, whatever the solver."""
+    """The states after x0 and the continuous log weight. An exactly observed end is pinned,
+    whatever the solver.
+    """
     t_end = ts[-1]
 
     @jax.checkpoint
@@ -111,7 +132,9 @@ def travel_continuous(
     (x, log_weight), path = jax.lax.scan(step, start, (ts[:free], ts[1 : free + 1], noise[:free]))
     if seen.exact:
         message = exact_message(auxiliary, seen, ts[-2], t_end, x, observed)
-        log_weight = log_weight + (t_end - ts[-2]) * weight_rate(sde, auxiliary, message, ts[-2], x)[1]
+        log_weight = (
+            log_weight + (t_end - ts[-2]) * weight_rate(sde, auxiliary, message, ts[-2], x)[1]
+        )
         end, _ = arrive(sde, seen, ts, x, noise[-1][: sde.noise_size(x)], observed)
         path = jnp.concatenate([path, end[None]])
     return path, log_weight

@@ -1,6 +1,8 @@
-"""The hot line of a guided step, u = z + Aᵀ N⁻ᵀ (y − (N + P)⁻¹ A z) and log|P| − log|N|, with a derivative by hand.
+"""The hot line of a guided step, u = z + Aᵀ N⁻ᵀ (y − (N + P)⁻¹ A z) and log|P| − log|N|, with a
+derivative by hand.
 
-With N Nᵀ = S, P Pᵀ = M, y = N⁻¹ r, g = (N + P)⁻¹ A z, h = y − g, w = N⁻ᵀ h, so u = z + Aᵀ w. A factor changes by
+With N Nᵀ = S, P Pᵀ = M, y = N⁻¹ r, g = (N + P)⁻¹ A z, h = y − g, w = N⁻ᵀ h, so u = z + Aᵀ w. A
+factor changes by
 
     dN = N F,      F = Φ(N⁻¹ dS N⁻ᵀ),      Φ the lower half of its argument, half of the diagonal,
 
@@ -64,5 +66,7 @@ def _factor_change(L, dS):
 
 
 def _times(F, x):
-    """F x for a few columns, without a `dot`: the transposes, outer products, become one loop over F."""
+    """F x for a few columns, without a `dot`: the transposes, outer products, become one loop over
+    F.
+    """
     return jnp.sum(F[:, :, None] * x[None, :, :], axis=1)

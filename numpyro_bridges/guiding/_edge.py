@@ -1,7 +1,9 @@
-"""One edge: a path from a state to what is seen of its end, its log weight, and the way back from a path to its noise.
+"""One edge: a path from a state to what is seen of its end, its log weight, and the way back from a
+path to its noise.
 
-`travel` takes steps led by a plan, as to an inner node of a tree; `arrive` takes the last step to what is seen, onto
-the observation itself, exactly whatever guides; `reach` does both. `retrace` and `retrace_reach` recover the noise.
+`travel` takes steps led by a plan, as to an inner node of a tree; `arrive` takes the last step to
+what is seen, onto the observation itself, exactly whatever guides; `reach` does both. `retrace` and
+`retrace_reach` recover the noise.
 """
 
 import functools
@@ -21,7 +23,9 @@ from ._steering import GaussianSteering
 from ._step import GridNoise, GuidedStep, GuidedTerm
 
 _MAX_KEPT = 64
-"""Largest n whose Cholesky factors, three n × n matrices a step, are kept for the reverse pass, not computed again."""
+"""Largest n whose Cholesky factors, three n × n matrices a step, are kept for the reverse pass, not
+computed again.
+"""
 
 
 def travel(
@@ -39,7 +43,9 @@ def travel(
     few = x0.shape[0] <= _MAX_KEPT
 
     @functools.partial(
-        jax.checkpoint, prevent_cse=False, policy=lambda primitive, *_, **__: few and primitive.name == "cholesky"
+        jax.checkpoint,
+        prevent_cse=False,
+        policy=lambda primitive, *_, **__: few and primitive.name == "cholesky",
     )
     def step(y, inputs):
         t0, t1, z, planned = inputs
@@ -55,7 +61,12 @@ def travel(
 
 
 def arrive(
-    sde: AbstractSDE, seen: Observation, ts: Float[Array, " K+1"], x: State, z: Noise, observed: State
+    sde: AbstractSDE,
+    seen: Observation,
+    ts: Float[Array, " K+1"],
+    x: State,
+    z: Noise,
+    observed: State,
 ) -> tuple[State, Float[Array, ""]]:
     """The last state, and the log density of what is seen given the last but one."""
     transition, steering = _last_step(sde, seen, ts, x, observed)
@@ -72,7 +83,9 @@ def reach(
     noise: Float[Array, "K k *dim"],
     observed: State,
 ) -> tuple[Float[Array, "K n *dim"], Float[Array, ""]]:
-    """The states after x0, to an end that is seen, and the log weight. The plan has an entry for each time but it."""
+    """The states after x0, to an end that is seen, and the log weight. The plan has an entry for
+    each time but it.
+    """
     path, x, log_weight = travel(sde, plan, ts[:-1], x0, noise[:-1], observed)
     end, log_density = arrive(sde, seen, ts, x, noise[-1], observed)
     return jnp.concatenate([path, end[None]]), log_weight + log_density
@@ -86,7 +99,9 @@ def retrace(
     observed: State,
     key: PRNGKeyArray | None,
 ) -> Float[Array, "K k *dim"]:
-    """The noise by which `travel` takes a path; what the path leaves free of it is drawn with `key`, 0 without one."""
+    """The noise by which `travel` takes a path; what the path leaves free of it is drawn with
+    `key`, 0 without one.
+    """
 
     def step(x, x_next, t0, t1, planned, free):
         transition = sde.transition(t0, t1, x)
@@ -138,7 +153,9 @@ def _last_step(sde, seen, ts, x, observed) -> tuple[Transition, GaussianSteering
         none = jnp.zeros((), x.dtype)
         covariance = LowRank(Errors.of(seen.factor), none, compose(seen.operator, sigma), none)
     shift = jnp.zeros_like(observed)
-    return transition, steered(transition, dt, seen.operator, shift, covariance, observed, seen.exact)
+    return transition, steered(
+        transition, dt, seen.operator, shift, covariance, observed, seen.exact
+    )
 
 
 def _driving_noise(transition: Transition, x: State, free: Noise) -> Noise:

@@ -1,29 +1,41 @@
 """Steps that are driven by fewer noises than numbers are observed: the algebra of the noises.
 
-Let k noises drive m > k observed values, v ~ N(x + s G u, E + κ G Gᵀ), u ~ N(0, I): the step, and the time left after
-it. With r = v − x,
+Let k noises drive m > k observed values, v ~ N(x + s G u, E + κ G Gᵀ), u ~ N(0, I): the step, and
+the time left after it. With r = v − x,
 
     C = Gᵀ E⁻¹ G,      f = Gᵀ E⁻¹ r,      H = (I + κ C)⁻¹ C,
 
-the law of u given v is N(Π⁻¹ s (I + κ C)⁻¹ f, Π⁻¹), Π = I + s² H, and all matrices are k × k. E is what no path
-changes: errors that are independent, and what is bridged by a covariance of the end, E = D + λ F Fᵀ, D diagonal. With
-N Nᵀ = I + λ Fᵀ D⁻¹ F
+the law of u given v is N(Π⁻¹ s (I + κ C)⁻¹ f, Π⁻¹), Π = I + s² H, and all matrices are k × k. E is
+what no path changes: errors that are independent, and what is bridged by a covariance of the end, E
+= D + λ F Fᵀ, D diagonal. With N Nᵀ = I + λ Fᵀ D⁻¹ F
 
-    E⁻¹ = D⁻¹ − λ D⁻¹ F N⁻ᵀ N⁻¹ Fᵀ D⁻¹                                                       (Woodbury).
+    E⁻¹ = D⁻¹ − λ D⁻¹ F N⁻ᵀ N⁻¹ Fᵀ D⁻¹
+    (Woodbury).
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linalg import add, apply, cholesky, columns, congruence, log_diagonal, solve_lower, transpose
+from .._linalg import (
+    add,
+    apply,
+    cholesky,
+    columns,
+    congruence,
+    log_diagonal,
+    solve_lower,
+    transpose,
+)
 from .._types import Noise, State, Structured
 from ..conditioning import whitened_log_density
 from ._steering import AbstractSteering, log_ratio
 
 
 def are_few(sigma: Structured, num_values: int) -> bool:
-    """Whether so many noises are fewer than these values by so much that their algebra is the cheaper one."""
+    """Whether so many noises are fewer than these values by so much that their algebra is the
+    cheaper one.
+    """
     return sigma.ndim == 2 and 2 * sigma.shape[1] <= num_values
 
 
@@ -116,7 +128,9 @@ class LowRank(eqx.Module):
 
 
 class NoiseSteering(AbstractSteering):
-    """The conditional law of u given v, whose difference r to its forecast at the step's mean is s G u and an error."""
+    """The conditional law of u given v, whose difference r to its forecast at the step's mean is s
+    G u and an error.
+    """
 
     covariance: LowRank
     step: Float[Array, ""]
@@ -143,10 +157,15 @@ class NoiseSteering(AbstractSteering):
         return apply(transpose(self.factor), u) - self.pull
 
     def log_evidence(self) -> Float[Array, ""]:
-        """log density of v given the present state, on the last step, where nothing but independent errors is left.
+        """log density of v given the present state, on the last step, where nothing but independent
+        errors is left.
 
         By what is left of r at the mean, whose digits are those of the errors.
         """
         u, sd = self.mean(), self.covariance.errors.sd
         left = solve_lower(sd, self.r) - self.step * apply(self.covariance.factor, u)
-        return whitened_log_density(left, sd) - 0.5 * jnp.sum(u * u) - columns(u) * log_diagonal(self.factor, len(u))
+        return (
+            whitened_log_density(left, sd)
+            - 0.5 * jnp.sum(u * u)
+            - columns(u) * log_diagonal(self.factor, len(u))
+        )

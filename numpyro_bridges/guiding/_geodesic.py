@@ -1,17 +1,18 @@
-"""A guide that follows geodesics: one step of Newton's method from the straight line towards the path of least energy.
+"""A guide that follows geodesics: one step of Newton's method from the straight line towards the
+path of least energy.
 
 For small noise −log h is the energy of the path that the Hamiltonian
 
     H(x, p) = pᵀ b(x) + ½ pᵀ a(x) p,        x' = ∂H/∂p,        p' = −∂H/∂x
 
-leads from x to what is observed: for a flow, a geodesic of the metric a⁻¹. The receding guide freezes a, so its path is
-a straight line. Its momentum p at x_k is that of such a path nearly; where it leads, (x̂, p̂) at the end, tells how far
-it misses v,
+leads from x to what is observed: for a flow, a geodesic of the metric a⁻¹. The receding guide
+freezes a, so its path is a straight line. Its momentum p at x_k is that of such a path nearly;
+where it leads, (x̂, p̂) at the end, tells how far it misses v,
 
     v − L x̂ − Σ λ̂,      p̂ = Lᵀ λ̂,      Σ the covariance of the error,
 
-and the target is moved by a part of it. What is seen of a state beyond the end, as at the inner nodes of trees, is seen
-at a later time: there the path ends.
+and the target is moved by a part of it. What is seen of a state beyond the end, as at the inner
+nodes of trees, is seen at a later time: there the path ends.
 """
 
 from collections.abc import Callable
@@ -29,14 +30,17 @@ from ._guides import AbstractGuide, AbstractPlan, FrozenGuide, RecedingGuide, Re
 
 
 class GeodesicGuide(AbstractGuide):
-    """`RecedingGuide` with its target corrected, at every step, towards the geodesic to what is observed.
+    """`RecedingGuide` with its target corrected, at every step, towards the geodesic to what is
+    observed.
 
-    It costs about two receding steps and is worth it where the metric bends paths, as in flows whose displacements are
-    not small beside the length scale: the guide for shapes. Where a is constant this is `FrozenGuide`.
+    It costs about two receding steps and is worth it where the metric bends paths, as in flows
+    whose displacements are not small beside the length scale: the guide for shapes. Where a is
+    constant this is `FrozenGuide`.
 
     **Arguments:**
 
-    - `correction`: γ, the part of the correction that is made, from 0 to 1. A full one overshoots on rough paths.
+    - `correction`: γ, the part of the correction that is made, from 0 to 1. A full one overshoots
+      on rough paths.
     - `end_weight`: as for `RecedingGuide`.
 
     A correction longer than what is left to go is damped, so that no path is lost.
@@ -71,7 +75,7 @@ class GeodesicGuide(AbstractGuide):
 
 class _GeodesicPlan(AbstractPlan):
     steps: Any
-    """The receding plan's entry, the time, and the time left: at the step's end and at its start."""
+    """The receding plan's entry, the time, and the time left at the step's end and at its start"""
     receding: RecedingPlan
     sde: AbstractSDE
     correction_part: Structured
@@ -79,7 +83,9 @@ class _GeodesicPlan(AbstractPlan):
     def steer(self, step, transition, dt, x, observed):
         here, before = step
         miss, _ = self._miss(before, per_time(transition, dt), x, observed)
-        return self.receding.steer(here[0], transition, dt, x, observed + self.correction_part * miss)
+        return self.receding.steer(
+            here[0], transition, dt, x, observed + self.correction_part * miss
+        )
 
     def message(self, step, sde, t, x, observed):
         return self.receding.message(step[0][0], sde, t, x, observed)
@@ -112,7 +118,9 @@ class _GeodesicPlan(AbstractPlan):
             momentum = apply(jnp.where(L == 0, 0.0, 1 / jnp.where(L == 0, 1.0, L)), p)
         miss = observed - apply(L, x) - apply(error, momentum)
         to_go = jnp.sum(r * solve(r))
-        excess = jnp.where(to_go > 0, jnp.sum(miss * solve(miss)) / jnp.where(to_go > 0, to_go, 1.0), 0.0)
+        excess = jnp.where(
+            to_go > 0, jnp.sum(miss * solve(miss)) / jnp.where(to_go > 0, to_go, 1.0), 0.0
+        )
         return miss / (1 + (0.5 * excess) ** 2), solve
 
 
@@ -125,10 +133,11 @@ def _solver(covariance: Structured | LowRank) -> Callable[[State], State]:
 
 
 def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:
-    """`FrozenGuide()` where a is constant, `GeodesicGuide()` for a flow, `RecedingGuide()` elsewhere.
+    """`FrozenGuide()` where a is constant, `GeodesicGuide()` for a flow, `RecedingGuide()`
+    elsewhere.
 
-    With a drift, geodesics are no better than the linearised drift; with a strong one they are worse. A semilinear
-    equation is linearised along a path, in two rounds.
+    With a drift, geodesics are no better than the linearised drift; with a strong one they are
+    worse. A semilinear equation is linearised along a path, in two rounds.
     """
     rounds = 2 if isinstance(sde, SemilinearSDE) else 0
     if sde.has_constant_covariance(x):

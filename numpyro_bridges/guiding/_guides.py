@@ -1,10 +1,11 @@
 """Guides: how a path is led to what is observed.
 
-`guide.plan(...)` does what depends on the parameters and the grid only, once; the plan's `steer` is the cheap work of
-one step. A guide may know the parameters, the data and the path so far, never later noise.
+`guide.plan(...)` does what depends on the parameters and the grid only, once; the plan's `steer` is
+the cheap work of one step. A guide may know the parameters, the data and the path so far, never
+later noise.
 
-The backward filter in covariance form: with the auxiliary process's steps x' ~ N(Φ x + φ, C) and v = L x_K + N(0, Σ),
-the forecast of v from x_k is N(Λ_k x_k + s_k, M_k),
+The backward filter in covariance form: with the auxiliary process's steps x' ~ N(Φ x + φ, C) and v
+= L x_K + N(0, Σ), the forecast of v from x_k is N(Λ_k x_k + s_k, M_k),
 
     Λ_K = L,  s_K = 0,  M_K = Σ;
     Λ_k = Λ_{k+1} Φ_k,   s_k = s_{k+1} + Λ_{k+1} φ_k,   M_k = M_{k+1} + Λ_{k+1} C_k Λ_{k+1}ᵀ.
@@ -37,20 +38,28 @@ from ._few_noises import Errors, LowRank, NoiseSteering, are_few
 from ._steering import AbstractSteering, DriftSteering, GaussianSteering
 
 _MAX_DENSE = 16
-"""Largest n for which the receding guide keeps a full matrix drift; beyond it the drift's diagonal guides."""
+"""Largest n for which the receding guide keeps a full matrix drift; beyond it the drift's diagonal
+guides.
+"""
 
 
 class AbstractPlan(eqx.Module):
-    """What a guide has prepared for a grid: `steps` has a leading axis, one entry per grid time but the last."""
+    """What a guide has prepared for a grid: `steps` has a leading axis, one entry per grid time but
+    the last.
+    """
 
     steps: eqx.AbstractVar[Any]
 
     @abc.abstractmethod
-    def steer(self, step: Any, transition: Transition, dt: RealScalar, x: State, observed: State) -> AbstractSteering:
+    def steer(
+        self, step: Any, transition: Transition, dt: RealScalar, x: State, observed: State
+    ) -> AbstractSteering:
         """Steering of a step from x, `step` being the entry of `steps` at the step's end."""
 
     @abc.abstractmethod
-    def message(self, step: Any, sde: AbstractSDE, t: RealScalar, x: State, observed: State) -> GaussianMessage:
+    def message(
+        self, step: Any, sde: AbstractSDE, t: RealScalar, x: State, observed: State
+    ) -> GaussianMessage:
         """h̃(t, ·) as the guide sees it at x, `step` being the entry of `steps` at time t."""
 
     def correction(self, step: Any, x: State) -> State:
@@ -65,16 +74,19 @@ class AbstractGuide(eqx.Module):
     def plan(self, sde: Displaced, seen: Observation, reference: State, ts) -> AbstractPlan:
         """Prepare for a grid.
 
-        **Arguments:** `sde`: the process of displacements y = x − `sde.origin`, in the time that has elapsed, of the
-        SDE `sde.sde`. `reference`: the displacement of a state that meets the condition, 0. `ts` `(K + 1,)`: times
-        that have elapsed. What is observed is a displacement too, of L x from L `sde.origin`.
+        **Arguments:** `sde`: the process of displacements y = x − `sde.origin`, in the time that
+        has elapsed, of the SDE `sde.sde`. `reference`: the displacement of a state that meets the
+        condition, 0. `ts` `(K + 1,)`: times that have elapsed. What is observed is a displacement
+        too, of L x from L `sde.origin`.
 
-        States that a guide holds are put into place by `state - sde.origin`, other SDEs by `sde.alongside(other)`.
+        States that a guide holds are put into place by `state - sde.origin`, other SDEs by
+        `sde.alongside(other)`.
         """
 
     @property
     def moves(self) -> bool:
-        """Whether it may be asked to plan for displacements from a moving origin, whose `sde` has no `origin`.
+        """Whether it may be asked to plan for displacements from a moving origin, whose `sde` has
+        no `origin`.
 
         So if it holds no states, and no process but the SDE's own.
         """
@@ -83,13 +95,16 @@ class AbstractGuide(eqx.Module):
     def prepared(
         self, sde: Displaced, seen: Observation, observed: State, reference: State, ts, start: State
     ) -> "AbstractGuide":
-        """The guide for paths from `start`, a displacement too, to what is observed, which `plan` is not told."""
+        """The guide for paths from `start`, a displacement too, to what is observed, which `plan`
+        is not told.
+        """
         return self
 
     def follows(self, sde: Displaced, seen: Observation, reference: State) -> bool:
         """Whether its covariances follow the state, that of what comes after the end too.
 
-        `plan` then takes `beyond`, the time after the end until the state is seen: the process goes on from there.
+        `plan` then takes `beyond`, the time after the end until the state is seen: the process goes
+        on from there.
         """
         return False
 
@@ -104,8 +119,9 @@ class AbstractGuide(eqx.Module):
     def auxiliary_process(self, sde: Displaced, reference: State, t1: RealScalar) -> LinearSDE:
         """The linear process whose h̃ is an exact h-transform, for the continuous-time weight."""
         raise ValueError(
-            "the continuous weight (a diffrax `solver`) needs a guide with one auxiliary process, since it weighs the "
-            f"path by that process's generator; {type(self).__name__} has none. Use `guide=FrozenGuide(...)`."
+            "the continuous weight (a diffrax `solver`) needs a guide with one auxiliary process, "
+            f"since it weighs the path by that process's generator; {type(self).__name__} has "
+            "none. Use `guide=FrozenGuide(...)`."
         )
 
 
@@ -119,7 +135,9 @@ class _FrozenPlan(AbstractPlan):
 
     def message(self, step, sde, t, x, observed):
         operator, shift, covariance = step
-        return GaussianMessage(operator, shift, semidefinite_cholesky(covariance), observed, jnp.zeros((), x.dtype))
+        return GaussianMessage(
+            operator, shift, semidefinite_cholesky(covariance), observed, jnp.zeros((), x.dtype)
+        )
 
 
 class FrozenGuide(AbstractGuide):
@@ -128,15 +146,17 @@ class FrozenGuide(AbstractGuide):
     **Arguments:**
 
     - `auxiliary`: a `LinearSDE` or `BrownianMotion`; by default the SDE itself, linearised.
-    - `rounds`: how often it is linearised along a path. With 0 it is linearised at the observed end, for all times.
-      The first round has the straight line from the start to the end, each further one the path that the guide of the
-      round before leads without noise. Two are the default of a `SemilinearSDE`, and worth a trial wherever a drift is
-      not linear: they help where the conditioned process stays near one path, and harm where it may cross an obstacle
-      at any time. A diffrax `solver` knows no rounds.
+    - `rounds`: how often it is linearised along a path. With 0 it is linearised at the observed
+      end, for all times. The first round has the straight line from the start to the end, each
+      further one the path that the guide of the round before leads without noise. Two are the
+      default of a `SemilinearSDE`, and worth a trial wherever a drift is not linear: they help
+      where the conditioned process stays near one path, and harm where it may cross an obstacle at
+      any time. A diffrax `solver` knows no rounds.
 
-    The auxiliary process is stepped by the SDE's own scheme, so that an auxiliary process equal to the SDE gives the
-    same log weight for every noise. Schauer, van der Meulen and van Zanten (2017); Mider, Schauer and van der
-    Meulen (2021). Rounds are those of the iterated extended Kalman smoother (Bell 1994).
+    The auxiliary process is stepped by the SDE's own scheme, so that an auxiliary process equal to
+    the SDE gives the same log weight for every noise. Schauer, van der Meulen and van Zanten
+    (2017); Mider, Schauer and van der Meulen (2021). Rounds are those of the iterated extended
+    Kalman smoother (Bell 1994).
     """
 
     auxiliary: AbstractSDE | None
@@ -152,7 +172,8 @@ class FrozenGuide(AbstractGuide):
         self.rounds = positive_integer(rounds, "rounds", least=0)
         require(
             auxiliary is None or self.rounds == 0,
-            f"`rounds` linearise the SDE itself, and `auxiliary` is linear; got rounds={rounds}. Give one of the two.",
+            f"`rounds` linearise the SDE itself, and `auxiliary` is linear; got rounds={rounds}. "
+            "Give one of the two.",
         )
         self.auxiliary, self.way = auxiliary, None
 
@@ -161,7 +182,9 @@ class FrozenGuide(AbstractGuide):
             try:
                 self.auxiliary.check_state(x)
             except ValueError as e:
-                raise ValueError(f"`auxiliary` must have the states of the SDE, {x.shape}: {e}") from e
+                raise ValueError(
+                    f"`auxiliary` must have the states of the SDE, {x.shape}: {e}"
+                ) from e
 
     @property
     def moves(self):
@@ -179,13 +202,16 @@ class FrozenGuide(AbstractGuide):
         auxiliary = self.auxiliary
         if auxiliary is None:
             return linearised_steps(sde, reference, ts, self.way)
-        return jax.vmap(lambda s, t: sde.auxiliary_step(auxiliary, s, t, reference))(ts[:-1], ts[1:])
+        return jax.vmap(lambda s, t: sde.auxiliary_step(auxiliary, s, t, reference))(
+            ts[:-1], ts[1:]
+        )
 
     def auxiliary_process(self, sde, reference, t1):
         require(
             self.rounds == 0,
-            f"`rounds` of a guide change what is linear at every step, and the continuous weight (a diffrax `solver`) "
-            f"needs one linear process; got rounds={self.rounds}. Use `guide=FrozenGuide()`.",
+            "`rounds` of a guide change what is linear at every step, and the continuous weight "
+            f"(a diffrax `solver`) needs one linear process; got rounds={self.rounds}. Use "
+            "`guide=FrozenGuide()`.",
         )
         process = sde if self.auxiliary is None else sde.alongside(self.auxiliary)
         B, beta = process.linearised_drift(t1, reference)
@@ -215,7 +241,9 @@ def linearised_steps(sde: Displaced, reference: State, ts, way: Way | None) -> A
     return jax.vmap(sde.linearised_step)(ts[:-1], ts[1:], way.at(ts[:-1]))
 
 
-def smoothed(guide, sde: Displaced, seen: Observation, observed: State, reference: State, ts, start: State):
+def smoothed(
+    guide, sde: Displaced, seen: Observation, observed: State, reference: State, ts, start: State
+):
     """A guide of some `rounds` with the way of its last one, a path that is led without noise.
 
     A path that is lost, numbers that are not finite, leaves the way as it was.
@@ -228,7 +256,9 @@ def smoothed(guide, sde: Displaced, seen: Observation, observed: State, referenc
     line = start[None] + rows(part, start[None]) * (reference - start)[None]
 
     def along(states):
-        return eqx.tree_at(lambda g: g.way, guide, Way(ts[:-1], states), is_leaf=lambda leaf: leaf is None)
+        return eqx.tree_at(
+            lambda g: g.way, guide, Way(ts[:-1], states), is_leaf=lambda leaf: leaf is None
+        )
 
     def another_round(states):
         plan = along(states).plan(sde, seen, reference, ts)
@@ -246,13 +276,16 @@ def smoothed(guide, sde: Displaced, seen: Observation, observed: State, referenc
         return jnp.where(jnp.all(jnp.isfinite(path)), path, states)
 
     states = line
-    for _ in range(guide.rounds - 1):  # a loop of JAX within loops takes longer to compile than a second copy
+    # a loop of JAX within loops takes longer to compile than a second copy
+    for _ in range(guide.rounds - 1):
         states = another_round(states)
     return along(states)
 
 
 class RecedingPlan(AbstractPlan):
-    """Flow, shift and accumulated time, of which the forecast is made with the covariance at the current state."""
+    """Flow, shift and accumulated time, of which the forecast is made with the covariance at the
+    current state.
+    """
 
     steps: tuple[Structured, State, Structured]
     seen: Observation
@@ -264,22 +297,40 @@ class RecedingPlan(AbstractPlan):
     def forecast(
         self, step, here: tuple[Structured, Structured]
     ) -> tuple[Structured, State, Structured | LowRank]:
-        """Operator, shift and covariance of what is observed, where σ and a of the process are these."""
+        """Operator, shift and covariance of what is observed, where σ and a of the process are
+        these.
+        """
         flow, shift, kappa = step
         sigma, a = here
         L, w = self.seen.operator, jnp.zeros(()) if self.end is None else self.end.weight
         if self.few is not None:
-            return compose(L, flow), shift, LowRank(self.few, w * kappa, compose(L, sigma), (1 - w) * kappa)
+            return (
+                compose(L, flow),
+                shift,
+                LowRank(self.few, w * kappa, compose(L, sigma), (1 - w) * kappa),
+            )
         if self.end is not None:
             a = (1 - w) * a + w * self.end.covariance
-        return compose(L, flow), shift, add(self.seen.covariance, congruence(L, _accumulated(kappa, a)))
+        return (
+            compose(L, flow),
+            shift,
+            add(self.seen.covariance, congruence(L, _accumulated(kappa, a))),
+        )
 
     def steer(self, step, transition, dt, x, observed):
-        return steered(transition, dt, *self.forecast(step, per_time(transition, dt)), observed, self.seen.exact)
+        return steered(
+            transition,
+            dt,
+            *self.forecast(step, per_time(transition, dt)),
+            observed,
+            self.seen.exact,
+        )
 
     def message(self, step, sde, t, x, observed):
         operator, shift, covariance = self.forecast(step, sde.noise(t, x))
-        factor = semidefinite_cholesky(covariance.dense() if isinstance(covariance, LowRank) else covariance)
+        factor = semidefinite_cholesky(
+            covariance.dense() if isinstance(covariance, LowRank) else covariance
+        )
         return GaussianMessage(operator, shift, factor, observed, jnp.zeros((), x.dtype))
 
 
@@ -289,15 +340,17 @@ class _End(NamedTuple):
 
 
 class RecedingGuide(AbstractGuide):
-    """The backward filter with the covariance frozen at the current state and renewed at every step.
+    """The backward filter with the covariance frozen at the current state and renewed at every
+    step.
 
-    The time left after step k is bridged by ã = a(x_k), the drift linearised at the observed end. Worth several nats in
-    the spread of the log weight where a depends strongly on the state. Where a is constant this is `FrozenGuide`.
+    The time left after step k is bridged by ã = a(x_k), the drift linearised at the observed end.
+    Worth several nats in the spread of the log weight where a depends strongly on the state. Where
+    a is constant this is `FrozenGuide`.
 
     **Arguments:**
 
-    - `end_weight`: ã = (1 − end_weight) a(x_k) + end_weight a(reference). 0.2 helps on easy targets and harms on hard
-      ones.
+    - `end_weight`: ã = (1 − end_weight) a(x_k) + end_weight a(reference). 0.2 helps on easy targets
+      and harms on hard ones.
     - `rounds`: as for `FrozenGuide`: how often the drift is linearised along a path.
     """
 
@@ -326,19 +379,29 @@ class RecedingGuide(AbstractGuide):
     def follows(self, sde, seen, reference):
         if sde.has_constant_covariance(reference):
             return False
-        flow = jax.eval_shape(lambda: sde.linearised_step(jnp.zeros(()), jnp.ones(()), reference).operator)
+        flow = jax.eval_shape(
+            lambda: sde.linearised_step(jnp.zeros(()), jnp.ones(()), reference).operator
+        )
         return flow.ndim == 0
 
     def plan(self, sde, seen, reference, ts, beyond=0.0):
         if sde.has_constant_covariance(reference):
-            return FrozenGuide().plan(sde, seen, reference, ts, linearised_steps(sde, reference, ts, self.way))
+            return FrozenGuide().plan(
+                sde, seen, reference, ts, linearised_steps(sde, reference, ts, self.way)
+            )
         steps = linearised_steps(sde, reference, ts, self.way)
         operator, shift = steps.operator, steps.shift
         n, ndim = reference.shape[0], operator.ndim - 1
         if ndim == 2 and n > _MAX_DENSE:
             kept = jnp.diagonal(operator, axis1=1, axis2=2)
-            near = jnp.broadcast_to(reference, shift.shape) if self.way is None else self.way.at(ts[:-1])
-            shift = shift + jax.vmap(lambda full, d, y: full @ y - apply(d, y))(operator, kept, near)
+            near = (
+                jnp.broadcast_to(reference, shift.shape)
+                if self.way is None
+                else self.way.at(ts[:-1])
+            )
+            shift = shift + jax.vmap(lambda full, d, y: full @ y - apply(d, y))(
+                operator, kept, near
+            )
             operator, ndim = kept, 1
 
         def back(carry, inputs):
@@ -363,10 +426,11 @@ class RecedingGuide(AbstractGuide):
 
 
 class DriftGuide(AbstractGuide):
-    """Another guide's score as a drift: Euler steps of b + a ∇log h̃ instead of the conditional Gaussian step.
+    """Another guide's score as a drift: Euler steps of b + a ∇log h̃ instead of the conditional
+    Gaussian step.
 
-    The weight is still the exact discrete ratio. It overshoots where dt · a · H is not small, which the guided step
-    does not.
+    The weight is still the exact discrete ratio. It overshoots where dt · a · H is not small, which
+    the guided step does not.
     """
 
     guide: AbstractGuide
@@ -430,7 +494,9 @@ def steered(
     observed: State,
     may_be_empty: bool = False,
 ) -> GaussianSteering | NoiseSteering:
-    """A step whose end is seen as N(operator x' + shift, covariance), in the space of what is smaller."""
+    """A step whose end is seen as N(operator x' + shift, covariance), in the space of what is
+    smaller.
+    """
     if not isinstance(covariance, LowRank):
         return GaussianSteering(transition, operator, shift, covariance, observed, may_be_empty)
     r = observed - shift - apply(operator, transition.mean)
@@ -461,7 +527,9 @@ def _square(flow: Structured) -> Structured:
     """Ψ ⊗ Ψ, so that Ψ a Ψᵀ is `_accumulated(Ψ ⊗ Ψ, a)`."""
     if flow.ndim == 0:
         return flow * flow
-    return flow[:, None] * flow[None, :] if flow.ndim == 1 else jnp.einsum("ia,jb->iajb", flow, flow)
+    return (
+        flow[:, None] * flow[None, :] if flow.ndim == 1 else jnp.einsum("ia,jb->iajb", flow, flow)
+    )
 
 
 def _accumulated(kappa: Structured, a: Structured) -> Structured:

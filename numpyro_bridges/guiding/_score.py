@@ -4,9 +4,9 @@ With h̃ the guide's and h the true function, the network is to be
 
     s(t, x) = ∇log h(t, x) − ∇log h̃(t, x),
 
-what the guide lacks; the part of ∇log h that is singular near the end is the guide's. In a step z ~ N(0, I) becomes
-z + √dt σᵀ s before it is guided, and the log weight gains log N(z + √dt σᵀ s; 0, I) − log N(z; 0, I): exact whatever
-the network says (Yang, van der Meulen and Sommer 2025).
+what the guide lacks; the part of ∇log h that is singular near the end is the guide's. In a step z ~
+N(0, I) becomes z + √dt σᵀ s before it is guided, and the log weight gains log N(z + √dt σᵀ s; 0, I)
+− log N(z; 0, I): exact whatever the network says (Yang, van der Meulen and Sommer 2025).
 """
 
 from collections.abc import Callable, Mapping
@@ -31,7 +31,9 @@ Context = Callable[[Any], Array]
 
 
 class LearnedSteering(AbstractSteering):
-    """z + shift, steered by `base`. `held` equals `shift`: it is what enters the density (see `ScoreGuide.held`)."""
+    """z + shift, steered by `base`. `held` equals `shift`: it is what enters the density (see
+    `ScoreGuide.held`).
+    """
 
     base: AbstractSteering
     shift: Noise
@@ -50,10 +52,12 @@ class LearnedSteering(AbstractSteering):
 
 
 class Standard(eqx.Module):
-    """How what a network sees is standardised: x̂ = (x − v)/scale, v̂ = (v − centre)/spread, and θ̂ alike.
+    """How what a network sees is standardised: x̂ = (x − v)/scale, v̂ = (v − centre)/spread, and θ̂
+    alike.
 
-    `scale` and `spread` are `(n, dim)`, or numbers for `Landmarks`, where v̂ is centred at its own mean instead: the
-    network then sees neither a translation nor the number of points. `duration` is that of the training.
+    `scale` and `spread` are `(n, dim)`, or numbers for `Landmarks`, where v̂ is centred at its own
+    mean instead: the network then sees neither a translation nor the number of points. `duration`
+    is that of the training.
     """
 
     duration: Float[Array, ""]
@@ -81,16 +85,19 @@ class ScoreGuide(AbstractGuide):
     **Arguments:**
 
     - `guide`: the guide that is corrected; `Unguided()` to learn all of ∇log h.
-    - `network`: an `equinox.Module` or function `network(t, x, v, theta)`, shaped like x `(n, dim)`: `t` from 0 to 1,
-      `x` the displacement from the target and `v` the target, standardised, `theta` `(c,)` the standardised context,
-      of size 0 if there is none. Its output in units of 1/√(T ā), ā the mean of the diagonal of a at the target,
-      times the weights of the space, is s.
+    - `network`: an `equinox.Module` or function `network(t, x, v, theta)`, shaped like x `(n,
+      dim)`: `t` from 0 to 1, `x` the displacement from the target and `v` the target, standardised,
+      `theta` `(c,)` the standardised context, of size 0 if there is none. Its output in units of
+      1/√(T ā), ā the mean of the diagonal of a at the target, times the weights of the space, is s.
     - `standard`: how its input is standardised.
-    - `context`: `context(sde)`, the parameters that the network sees, `(c,)`; `None` if it was trained for one SDE.
-    - `history`: of the training: `update`, `loss`, `bound` (E log w held out), `ess` (of it, a fraction), `seconds`;
-      at the end `gain` and `gain_error`, of the bound over that of the guide alone, see `scores.fit`.
-    - `held`: a copy of the network with its gradient stopped, in training: the gradient of log w by the network is then
-      by the path alone (Roeder, Wu and Duvenaud 2017), which has no noise where the guide is perfect.
+    - `context`: `context(sde)`, the parameters that the network sees, `(c,)`; `None` if it was
+      trained for one SDE.
+    - `history`: of the training: `update`, `loss`, `bound` (E log w held out), `ess` (of it, a
+      fraction), `seconds`; at the end `gain` and `gain_error`, of the bound over that of the guide
+      alone, see `scores.fit`.
+    - `held`: a copy of the network with its gradient stopped, in training: the gradient of log w by
+      the network is then by the path alone (Roeder, Wu and Duvenaud 2017), which has no noise where
+      the guide is perfect.
     """
 
     guide: AbstractGuide
@@ -100,12 +107,22 @@ class ScoreGuide(AbstractGuide):
     history: dict[str, Array] = eqx.field(default_factory=dict)
     held: Callable | None = None
     programs: tuple[Closed | None, Closed | None] = eqx.field(init=False, default=(None, None))
-    """Network and context as one bridge holds them, where they are functions that may read more than their leaves."""
+    """Network and context as one bridge holds them, where they are functions that may read more
+    than their leaves.
+    """
 
     def __check_init__(self):
         require_instance(self.guide, AbstractGuide, "guide", "a guide, such as `RecedingGuide()`")
-        require(callable(self.network), f"`network` must be a function (t, x, v, theta); got {words(self.network)}.")
-        require_instance(self.standard, Standard, "standard", "a `Standard`, which `numpyro_bridges.scores.fit` makes")
+        require(
+            callable(self.network),
+            f"`network` must be a function (t, x, v, theta); got {words(self.network)}.",
+        )
+        require_instance(
+            self.standard,
+            Standard,
+            "standard",
+            "a `Standard`, which `numpyro_bridges.scores.fit` makes",
+        )
         good = self.held is None or callable(self.held)
         require(good, f"`held` must be a network, or None; got {words(self.held)}.")
         require_instance(self.history, Mapping, "history", "a dictionary of arrays")
@@ -115,7 +132,8 @@ class ScoreGuide(AbstractGuide):
         scale, shape = self.standard.scale.shape, x.shape if x.ndim == 2 else (*x.shape, 1)
         require(
             scale in ((), shape),
-            f"`guide` was trained for states {scale}; got a state {x.shape}. Only landmarks may change their number.",
+            f"`guide` was trained for states {scale}; got a state {x.shape}. Only landmarks may "
+            "change their number.",
         )
 
     def closed(self, sde, x, ts):
@@ -130,7 +148,9 @@ class ScoreGuide(AbstractGuide):
         return closed
 
     def prepared(self, sde, seen, observed, reference, ts, start):
-        prepared = replace(self, guide=self.guide.prepared(sde, seen, observed, reference, ts, start))
+        prepared = replace(
+            self, guide=self.guide.prepared(sde, seen, observed, reference, ts, start)
+        )
         object.__setattr__(prepared, "programs", self.programs)
         return prepared
 
@@ -150,7 +170,9 @@ class ScoreGuide(AbstractGuide):
         target = self.standard.target(v + sde.origin.reshape(v.shape), pooled)
         inputs = v, target, theta
         network = self.network if network is None else network
-        return ScorePlan((base.steps, ts[-1] - ts[:-1]), base, network, self.held, self.standard, unit, inputs)
+        return ScorePlan(
+            (base.steps, ts[-1] - ts[:-1]), base, network, self.held, self.standard, unit, inputs
+        )
 
 
 class ScorePlan(AbstractPlan):
@@ -186,7 +208,9 @@ class ScorePlan(AbstractPlan):
         return self.base.message(step[0], sde, t, x, observed)
 
     def correction(self, step, x):
-        return self.base.correction(step[0], x) + self.score(self.network(*self.inputs(step[1], x)), x)
+        return self.base.correction(step[0], x) + self.score(
+            self.network(*self.inputs(step[1], x)), x
+        )
 
 
 class Unguided(AbstractGuide):

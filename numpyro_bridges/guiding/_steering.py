@@ -1,18 +1,20 @@
 """How a guide turns standard normal noise into the noise that drives a step.
 
-The model's step is x' = m + σ u with u ~ N(0, I). A guide replaces u by u = μ + B z with z ~ N(0, I), μ and B being
-functions of the past only, and the step's log weight is
+The model's step is x' = m + σ u with u ~ N(0, I). A guide replaces u by u = μ + B z with z ~ N(0,
+I), μ and B being functions of the past only, and the step's log weight is
 
     log p(u)/q(u) = ½|z|² − ½|u|² + dim log|B|.
 
-For a guide that forecasts the observation from the next state, v ~ N(Λ x' + s, P Pᵀ), the best u is the conditional law
-of u given v. With A = Λσ, N Nᵀ = P Pᵀ + A Aᵀ and y = N⁻¹(v − s − Λm),
+For a guide that forecasts the observation from the next state, v ~ N(Λ x' + s, P Pᵀ), the best u is
+the conditional law of u given v. With A = Λσ, N Nᵀ = P Pᵀ + A Aᵀ and y = N⁻¹(v − s − Λm),
 
-    μ = Aᵀ N⁻ᵀ y,      B = I − Aᵀ N⁻ᵀ (N + P)⁻¹ A,      |B| = |P|/|N|,      B⁻¹ = I + Aᵀ (N + P)⁻ᵀ P⁻¹ A
+    μ = Aᵀ N⁻ᵀ y,      B = I − Aᵀ N⁻ᵀ (N + P)⁻¹ A,      |B| = |P|/|N|,      B⁻¹ = I + Aᵀ (N + P)⁻ᵀ
+    P⁻¹ A
 
-(the square-root measurement update of Andrews 1968). Both factors are needed for the density in any case and all solves
-act on states, so no triangular solve with a matrix on the right, no k × k factorisation and no inverse of a is formed;
-with P = 0, an exact observation, B is the projection on the noises that the observation leaves free.
+(the square-root measurement update of Andrews 1968). Both factors are needed for the density in any
+case and all solves act on states, so no triangular solve with a matrix on the right, no k × k
+factorisation and no inverse of a is formed; with P = 0, an exact observation, B is the projection
+on the noises that the observation leaves free.
 """
 
 import abc
@@ -54,7 +56,9 @@ class AbstractSteering(eqx.Module):
 
     @abc.abstractmethod
     def inverse(self, u: Noise) -> Noise:
-        """The z that gives u; where an exact observation leaves part of z without effect, that part is 0."""
+        """The z that gives u; where an exact observation leaves part of z without effect, that part
+        is 0.
+        """
 
 
 def log_ratio(z: Noise, u: Noise) -> Float[Array, ""]:
@@ -63,11 +67,12 @@ def log_ratio(z: Noise, u: Noise) -> Float[Array, ""]:
 
 
 class GaussianSteering(AbstractSteering):
-    """The conditional law of the noise given v ~ N(operator x' + shift, covariance); covariance None is exact.
+    """The conditional law of the noise given v ~ N(operator x' + shift, covariance); covariance
+    None is exact.
 
-    Where v is a forecast of something seen without noise, `may_be_empty`, a part of it may have no variance at all, and
-    then tells nothing of the noise of the step: it is filled with a variance of 1, and `log_evidence` alone asks
-    whether it is as it must be.
+    Where v is a forecast of something seen without noise, `may_be_empty`, a part of it may have no
+    variance at all, and then tells nothing of the noise of the step: it is filled with a variance
+    of 1, and `log_evidence` alone asks whether it is as it must be.
     """
 
     A: Structured
@@ -90,7 +95,11 @@ class GaussianSteering(AbstractSteering):
         S = S if covariance is None else add(covariance, S)
         self.empty = without_variance(S) if may_be_empty else jnp.zeros((), bool)
         self.S = filled(S, self.empty) if may_be_empty else S
-        self.M = filled(covariance, self.empty) if may_be_empty and covariance is not None else covariance
+        self.M = (
+            filled(covariance, self.empty)
+            if may_be_empty and covariance is not None
+            else covariance
+        )
         self.r = observed - shift - apply(operator, transition.mean)
 
     def _factors(self) -> tuple[Structured, Structured, State]:
@@ -113,7 +122,11 @@ class GaussianSteering(AbstractSteering):
             N, total, y = self._factors()
             u = z + self._lift(N, y - solve_lower(total, apply(self.A, z)))
             m = self.r.shape[0]
-            log_det = -jnp.inf if self.M is None else log_diagonal(cholesky(self.M), m) - log_diagonal(N, m)
+            log_det = (
+                -jnp.inf
+                if self.M is None
+                else log_diagonal(cholesky(self.M), m) - log_diagonal(N, m)
+            )
         return u, log_ratio(z, u) + columns(z) * log_det
 
     def inverse(self, u):

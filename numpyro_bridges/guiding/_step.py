@@ -1,7 +1,8 @@
-"""The guided step, a diffrax solver over the pair (state, log weight), and the driving noise on a grid.
+"""The guided step, a diffrax solver over the pair (state, log weight), and the driving noise on a
+grid.
 
-Each state is drawn from the model's own transition conditioned on the guide's forecast; the log weight is the exact
-discrete ratio.
+Each state is drawn from the model's own transition conditioned on the guide's forecast; the log
+weight is the exact discrete ratio.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,8 @@ from ._guides import AbstractPlan
 
 
 class GridNoise(diffrax.AbstractBrownianPath):
-    """Standard normal noise on a grid as a Brownian path; between grid times a lookup, √dt z_k, no interpolation.
+    """Standard normal noise on a grid as a Brownian path; between grid times a lookup, √dt z_k, no
+    interpolation.
 
     **Arguments:** `ts` `(K + 1,)`; `noise` `(K, k, dim)`, or `(K, 2k, dim)` where `levy_area` is
     `diffrax.SpaceTimeLevyArea`: the second half drives the area, H = √(dt/12) z.
@@ -53,10 +55,11 @@ class GridNoise(diffrax.AbstractBrownianPath):
 
 
 class GuidedTerm(diffrax.AbstractTerm):
-    """What `GuidedStep` steps: an SDE, a plan (`step(t0)`: its entry at the step's end), the target, noise.
+    """What `GuidedStep` steps: an SDE, a plan (`step(t0)`: its entry at the step's end), the
+    target, noise.
 
-    The product with a step's noise is what the step leads to, not an increment: near an exact end, to which states are
-    displacements, sums of increments would lose its digits.
+    The product with a step's noise is what the step leads to, not an increment: near an exact end,
+    to which states are displacements, sums of increments would lose its digits.
     """
 
     sde: AbstractSDE
@@ -66,7 +69,9 @@ class GuidedTerm(diffrax.AbstractTerm):
     control: diffrax.AbstractPath
 
     @classmethod
-    def of(cls, sde: AbstractSDE, plan: AbstractPlan, observed: State, ts: Array, noise: Array) -> "GuidedTerm":
+    def of(
+        cls, sde: AbstractSDE, plan: AbstractPlan, observed: State, ts: Array, noise: Array
+    ) -> "GuidedTerm":
         """On a grid, each of whose times has an entry in the plan."""
         control = GridNoise(ts=ts, noise=noise)
 
@@ -80,7 +85,8 @@ class GuidedTerm(diffrax.AbstractTerm):
 
     def contr(self, t0, t1, **kwargs):
         dt = t1 - t0
-        z = self.control.evaluate(t0, t1) / jnp.sqrt(jnp.where(dt == 0, 1.0, dt))  # a step may have no length
+        # a step may have no length
+        z = self.control.evaluate(t0, t1) / jnp.sqrt(jnp.where(dt == 0, 1.0, dt))
         return t0, t1, z, self.step(t0)
 
     def prod(self, vf, control):
@@ -91,7 +97,8 @@ class GuidedTerm(diffrax.AbstractTerm):
 
 
 class GuidedStep(diffrax.AbstractItoSolver):
-    """One step of the model's transition, conditioned on the guide's forecast; adds the step's exact log weight.
+    """One step of the model's transition, conditioned on the guide's forecast; adds the step's
+    exact log weight.
 
     Nothing blows up as the observation noise vanishes or dt · a · H grows.
     """

@@ -7,7 +7,10 @@ from ._evidence import (
     estimate_model_evidence as estimate_model_evidence,
     estimate_tree_evidence as estimate_tree_evidence,
 )
-from ._hmc import FunctionSpaceHMC as FunctionSpaceHMC, FunctionSpaceHMCState as FunctionSpaceHMCState
+from ._hmc import (
+    FunctionSpaceHMC as FunctionSpaceHMC,
+    FunctionSpaceHMCState as FunctionSpaceHMCState,
+)
 from ._pcn import PCN as PCN, PCNL as PCNL, PCNState as PCNState
 from ._posterior import init_to_guided_mean as init_to_guided_mean, noise_sites as noise_sites
 from ._pseudo_marginal import (

@@ -1,10 +1,11 @@
 """Results for ArviZ: 0.x, an `InferenceData`, and 1.x, a `DataTree`.
 
-The driving noise is left out: thousands of numbers, none of them of interest. The log likelihood log p(v_i | z_i, θ) is
-conditional on it, and good for leave-one-out all the same: p(v | θ) is its mean over z ~ N(0, I), so that
-E[1/p(v_i | z_i, θ)] over the posterior of (z, θ) is E[1/p(v_i | θ)] over that of θ, the same estimand. The spread of
-the bridge's weights adds to that of the importance ratios: read Pareto k̂. The data of a tree are left out node by
-node, `DiffusionTree.log_prob_by_node`.
+The driving noise is left out: thousands of numbers, none of them of interest. The log likelihood
+log p(v_i | z_i, θ) is conditional on it, and good for leave-one-out all the same: p(v | θ) is its
+mean over z ~ N(0, I), so that E[1/p(v_i | z_i, θ)] over the posterior of (z, θ) is E[1/p(v_i | θ)]
+over that of θ, the same estimand. The spread of the bridge's weights adds to that of the importance
+ratios: read Pareto k̂. The data of a tree are left out node by node,
+`DiffusionTree.log_prob_by_node`.
 """
 
 import warnings
@@ -39,43 +40,51 @@ def to_arviz(
 
     **Arguments:**
 
-    - `mcmc`: after `run`, with any kernel of a model. Sample statistics are what the run has collected:
-      `extra_fields=nb.infer.fields(kernel)` asks for all.
-    - `prior`, `posterior_predictive`: dictionaries from `numpyro.infer.Predictive`. Those of the posterior
-      may come from flat draws or from draws by chain (`batch_ndims=2`), and from some of the draws: a
-      warning says so, and flat ones then count as one chain, since theirs are not known.
+    - `mcmc`: after `run`, with any kernel of a model. Sample statistics are what the run has
+      collected: `extra_fields=nb.infer.fields(kernel)` asks for all.
+    - `prior`, `posterior_predictive`: dictionaries from `numpyro.infer.Predictive`. Those of the
+      posterior may come from flat draws or from draws by chain (`batch_ndims=2`), and from some of
+      the draws: a warning says so, and flat ones then count as one chain, since theirs are not
+      known.
     - `coords`, `dims`: as in ArviZ; plates name their axes.
     - `noise`: keep the driving noise in the posterior.
-    - `nodes`: add the states of the nodes of every observed `DiffusionTree`, of all draws whose noise was kept.
-    - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all whose noise was kept;
-      none by default.
+    - `nodes`: add the states of the nodes of every observed `DiffusionTree`, of all draws whose
+      noise was kept.
+    - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all whose
+      noise was kept; none by default.
 
-    **Returns:** an `InferenceData` (ArviZ 0.x) or a `DataTree` (1.x) with the groups of the dictionaries and
+    **Returns:** an `InferenceData` (ArviZ 0.x) or a `DataTree` (1.x) with the groups of the
+    dictionaries and
 
-    - `posterior`, and `observed_data`. Data masked in every draw (`handlers.mask`, `obs_mask`) are NaN.
-    - `log_likelihood`: one value for each datum of each observed site (`numpyro.factor` sites are no data). Left out
-      are sites that need what the run has not kept, such as noise dropped by `extra_fields=("~z.wing_noise",)`, and
-      data masked in every draw, which say nothing: where a site has some, its seen data are one axis, `wing_seen`, and
-      coordinates such as `wing_specimens` say which they are. `handlers.scale` does not enter: the value is that of one
-      datum, counted once. A `DiffusionTree` has one value for each seen node, on the axis `node`, for leave-one-out
-      given all other nodes.
-    - `posterior_nodes`: of each observed `DiffusionTree` the states, with axes `chain`, `draw`, the plates, `node`,
-      `point` (unless states are vectors) and `coordinate`: ancestors, and tips behind their errors. Nodes without a
-      name are `node 7`, by their number in the tree. Left out are nodes that lead to nothing seen, and those that do
-      not vary: a fixed root, tips that are seen exactly. Their R-hat and ESS are in `arviz.summary(data,
-      group="posterior_nodes")`.
-    - `sample_stats`: under ArviZ's names. Those of a block of `Gibbs` have the class of its kernel in front,
-      `pcn_acceptance_rate`, numbered where blocks share it, `nuts0_lp`; a draw is `diverging` if any block was.
-    - `posterior_paths`: for each observed `DiffusionEndpoint` the bridges, with axes `chain`, `draw`, the plates,
-      `time`, `point` (unless states are vectors) and `coordinate`. An axis in which sites differ has the site's name in
-      front, `wing_time`. Times that vary with the draws or the data are a variable, `wing_times`. A `DiffusionTree` has
-      axes `branch`, labelled by the node at its end, and `step`, and its times are a variable always.
+    - `posterior`, and `observed_data`. Data masked in every draw (`handlers.mask`, `obs_mask`) are
+      NaN.
+    - `log_likelihood`: one value for each datum of each observed site (`numpyro.factor` sites are
+      no data). Left out are sites that need what the run has not kept, such as noise dropped by
+      `extra_fields=("~z.wing_noise",)`, and data masked in every draw, which say nothing: where a
+      site has some, its seen data are one axis, `wing_seen`, and coordinates such as
+      `wing_specimens` say which they are. `handlers.scale` does not enter: the value is that of one
+      datum, counted once. A `DiffusionTree` has one value for each seen node, on the axis `node`,
+      for leave-one-out given all other nodes.
+    - `posterior_nodes`: of each observed `DiffusionTree` the states, with axes `chain`, `draw`, the
+      plates, `node`, `point` (unless states are vectors) and `coordinate`: ancestors, and tips
+      behind their errors. Nodes without a name are `node 7`, by their number in the tree. Left out
+      are nodes that lead to nothing seen, and those that do not vary: a fixed root, tips that are
+      seen exactly. Their R-hat and ESS are in `arviz.summary(data, group="posterior_nodes")`.
+    - `sample_stats`: under ArviZ's names. Those of a block of `Gibbs` have the class of its kernel
+      in front, `pcn_acceptance_rate`, numbered where blocks share it, `nuts0_lp`; a draw is
+      `diverging` if any block was.
+    - `posterior_paths`: for each observed `DiffusionEndpoint` the bridges, with axes `chain`,
+      `draw`, the plates, `time`, `point` (unless states are vectors) and `coordinate`. An axis in
+      which sites differ has the site's name in front, `wing_time`. Times that vary with the draws
+      or the data are a variable, `wing_times`. A `DiffusionTree` has axes `branch`, labelled by the
+      node at its end, and `step`, and its times are a variable always.
 
-    A `/` in a name, as `handlers.scope` makes them, becomes a `.`: in a `DataTree` and in a NetCDF file it would be a
-    group. `dims` and `coords` may be given with either.
+    A `/` in a name, as `handlers.scope` makes them, becomes a `.`: in a `DataTree` and in a NetCDF
+    file it would be a group. `dims` and `coords` may be given with either.
 
-    **Errors:** `ValueError` for a kernel without a model, for `paths` without such a site, or without its noise, for
-    predictions that are not draws of this run, and for names that differ only in `/` and `.`.
+    **Errors:** `ValueError` for a kernel without a model, for `paths` without such a site, or
+    without its noise, for predictions that are not draws of this run, and for names that differ
+    only in `/` and `.`.
     """
     require_instance(mcmc, MCMC, "mcmc", "an `MCMC` of NumPyro")
     for name, groups in (
@@ -88,13 +97,23 @@ def to_arviz(
     noise, nodes = flag(noise, "noise"), flag(nodes, "nodes")
     paths = None if paths is None else positive_integer(paths, "paths")
     model = getattr(mcmc.sampler, "model", None)
-    require(callable(model), "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.")
+    require(
+        callable(model),
+        "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.",
+    )
     sites = sites_of(model, mcmc._args, mcmc._kwargs)
     observed = {name: site["value"] for name, site in sites.items() if _is_datum(site)}
     hidden = set() if noise else {name for name, site in sites.items() if is_noise(site)}
-    dims = {_plain(name): [_plain(axis) for axis in axes] for name, axes in (_plates(sites) | (dims or {})).items()}
+    dims = {
+        _plain(name): [_plain(axis) for axis in axes]
+        for name, axes in (_plates(sites) | (dims or {})).items()
+    }
     coords = _plainly(coords or {})
-    trees = {name: sites[name]["fn"].tree for name in observed if isinstance(sites[name]["fn"], DiffusionTree)}
+    trees = {
+        name: sites[name]["fn"].tree
+        for name in observed
+        if isinstance(sites[name]["fn"], DiffusionTree)
+    }
     samples = mcmc.get_samples(group_by_chain=True)
     shape = next(iter(samples.values())).shape[:2]
 
@@ -108,25 +127,41 @@ def to_arviz(
 
     def log_likelihood(values, names):
         found = replay(values, names).items()
-        return {name: law.log_prob_by_node(v) if name in trees else law.log_prob(v) for name, (law, v) in found}
+        return {
+            name: law.log_prob_by_node(v) if name in trees else law.log_prob(v)
+            for name, (law, v) in found
+        }
 
     def states(values, names):
         return {name: _states(law, value) for name, (law, value) in replay(values, names).items()}
 
     def bridges(values, names):
-        return {name: (law.path(value), law.times) for name, (law, value) in replay(values, names).items()}
+        return {
+            name: (law.path(value), law.times)
+            for name, (law, value) in replay(values, names).items()
+        }
 
     def visible(draws):
         return {name: value for name, value in draws.items() if name not in hidden}
 
     def lost(samples):
-        return {name: site["value"] for name, site in sites.items() if is_latent(site) and name not in samples}
+        return {
+            name: site["value"]
+            for name, site in sites.items()
+            if is_latent(site) and name not in samples
+        }
 
     def unknown(fn, names, samples):
         """Names of the sites for which `fn` needs what is lost."""
         first = {name: value[0, 0] for name, value in samples.items()}
-        needs = eval_provenance(lambda lost: fn(first | lost, names), lost=lost(samples)) if lost(samples) else {}
-        return {name for name, sources in needs.items() if frozenset().union(*jax.tree.leaves(sources))}
+        needs = (
+            eval_provenance(lambda lost: fn(first | lost, names), lost=lost(samples))
+            if lost(samples)
+            else {}
+        )
+        return {
+            name for name, sources in needs.items() if frozenset().union(*jax.tree.leaves(sources))
+        }
 
     lacking = unknown(log_likelihood, observed, samples)
     known = [name for name in observed if name not in lacking]
@@ -137,7 +172,8 @@ def to_arviz(
     if known:
         found = _mapped(lambda draw: log_likelihood(lost(samples) | draw, known), samples)
         axes = {
-            name: _leading_axes(name, value.ndim - 2 - (name in trees), dims) for name, value in found.items()
+            name: _leading_axes(name, value.ndim - 2 - (name in trees), dims)
+            for name, value in found.items()
         }
         own = {name: _labels(tree, dict.fromkeys(tree.observed)) for name, tree in trees.items()}
         datasets["log_likelihood"] = _seen_only(found, seen, axes, coords, own)
@@ -145,31 +181,41 @@ def to_arviz(
         draws, driving = _with_noise(mcmc)
         if not unknown(states, trees, driving):
             found = _mapped(lambda draw: states(lost(driving) | draw, trees), driving)
-            leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in trees}
+            leading = {
+                name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in trees
+            }
             datasets["posterior_nodes"] = _of_nodes(found, leading, draws, coords, trees)
     if paths is not None:
         draws, driving = _with_noise(mcmc)
         places = np.linspace(0, len(draws) - 1, min(paths, len(draws))).astype(int)
         kept = draws[places]
-        driven = [n for n in observed if isinstance(sites[n]["fn"], (DiffusionEndpoint, DiffusionTree))]
+        driven = [
+            n for n in observed if isinstance(sites[n]["fn"], (DiffusionEndpoint, DiffusionTree))
+        ]
         require(
             driven,
-            f"`paths` needs an observed `DiffusionEndpoint` or `DiffusionTree`; the model observes {sorted(observed)}.",
+            "`paths` needs an observed `DiffusionEndpoint` or `DiffusionTree`; the model observes "
+            f"{sorted(observed)}.",
         )
         require(
             not unknown(bridges, driven, driving),
-            f"`paths` needs the noise that drives {driven}, and the run has not kept {sorted(lost(driving))}. Run it "
-            f"without {[f'~z.{name}' for name in sorted(lost(driving))]} in `extra_fields`; if it is checkpointed, "
-            "with `keep_noise`, of at most `num_samples`.",
+            f"`paths` needs the noise that drives {driven}, and the run has not kept "
+            f"{sorted(lost(driving))}. Run it without "
+            f"{[f'~z.{name}' for name in sorted(lost(driving))]} in `extra_fields`; if it is "
+            "checkpointed, with `keep_noise`, of at most `num_samples`.",
         )
         found = _mapped(lambda draw: bridges(lost(driving) | draw, driven), driving, places)
-        leading = {name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven}
+        leading = {
+            name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven
+        }
         ends = {name: _labels(tree, tree.active) for name, tree in trees.items()}
         datasets["posterior_paths"] = _labelled(found, leading, kept, coords, ends)
     groups = {
         "posterior": visible(samples),
         "sample_stats": statistics(mcmc.get_extra_fields(group_by_chain=True), mcmc.sampler),
-        "observed_data": {name: _without(value, seen.get(name)) for name, value in observed.items()},
+        "observed_data": {
+            name: _without(value, seen.get(name)) for name, value in observed.items()
+        },
     }
     if posterior_predictive:
         ndims = {name: np.ndim(site["value"]) for name, site in sites.items()}
@@ -180,7 +226,9 @@ def to_arviz(
     if prior is not None:
         draws = {name: np.asarray(value)[None] for name, value in visible(prior).items()}
         groups["prior"] = {name: value for name, value in draws.items() if name not in observed}
-        groups["prior_predictive"] = {name: value for name, value in draws.items() if name in observed}
+        groups["prior_predictive"] = {
+            name: value for name, value in draws.items() if name in observed
+        }
     groups = {group: jax.device_get(values) for group, values in groups.items() if values}
     return _from_groups(groups, datasets, coords, dims)
 
@@ -189,7 +237,10 @@ def _with_noise(mcmc):
     """Indices of the draws whose noise is there, and the values of those draws."""
     samples = mcmc.get_samples(group_by_chain=True)
     draws = np.arange(next(iter(samples.values())).shape[1])
-    noise, every = mcmc.get_extra_fields(group_by_chain=True).get("noise"), getattr(mcmc, "_keep_noise", None)
+    noise, every = (
+        mcmc.get_extra_fields(group_by_chain=True).get("noise"),
+        getattr(mcmc, "_keep_noise", None),
+    )
     if not isinstance(noise, dict) or not every or every > len(draws):
         return draws, samples
     draws = draws[every - 1 :: every]
@@ -202,7 +253,10 @@ def _is_datum(site) -> bool:
 
 def _plates(sites) -> dict:
     """Names of the leading axes of each site, from its plates."""
-    frames = {name: sorted(site["cond_indep_stack"], key=lambda frame: frame.dim) for name, site in sites.items()}
+    frames = {
+        name: sorted(site["cond_indep_stack"], key=lambda frame: frame.dim)
+        for name, site in sites.items()
+    }
     return {name: [frame.name for frame in stack] for name, stack in frames.items() if stack}
 
 
@@ -224,14 +278,15 @@ def _by_chain(draws, ndims, shape) -> dict:
     leading = {value.shape[:number] for value in draws.values()}
     require(
         len(leading) == 1 and 0 not in min(leading),
-        f"`posterior_predictive` must hold the same draws of every site; got leading axes {sorted(leading)}.",
+        "`posterior_predictive` must hold the same draws of every site; got leading axes "
+        f"{sorted(leading)}.",
     )
     axes = leading.pop()
     whole = axes in (shape, (shape[0] * shape[1],))
     if not whole:
         warnings.warn(
-            f"`posterior_predictive` holds draws {axes} of a run of {shape[0]} chains and {shape[1]} draws: its chains "
-            "and draws are not those of the posterior.",
+            f"`posterior_predictive` holds draws {axes} of a run of {shape[0]} chains and "
+            f"{shape[1]} draws: its chains and draws are not those of the posterior.",
             stacklevel=3,
         )
     axes = shape if whole else (1,) * (2 - number) + axes
@@ -268,7 +323,7 @@ def _without(value, mask):
 
 
 def _states(law, observed):
-    """Of the root and of all nodes that lead to something seen, `(nodes, n, dim)` behind a batch."""
+    """Of the root and all nodes that lead to something seen, `(nodes, n, dim)` behind a batch."""
     nodes = np.array((0, *law.tree.active))
     return jnp.take(law.nodes(observed), nodes, axis=law.noise.ndim - 3)
 
@@ -288,12 +343,17 @@ def _of_nodes(found, leading, draws, coords, trees):
     for name, every in found.items():
         number = 2 + len(leading[name])
         before = tuple(range(number))
-        spread = np.fmax.reduce(every, axis=before) - np.fmin.reduce(every, axis=before)  # NaN where masked
-        varies = np.fmax.reduce(spread.reshape(len(spread), -1), axis=1) > 1e-6 * np.nanmax(np.abs(every))
+        # NaN where masked
+        spread = np.fmax.reduce(every, axis=before) - np.fmin.reduce(every, axis=before)
+        varies = np.fmax.reduce(spread.reshape(len(spread), -1), axis=1) > 1e-6 * np.nanmax(
+            np.abs(every)
+        )
         own = _labels(trees[name], [0, *trees[name].active])
         labels[name] = [label for label, kept in zip(own, varies, strict=True) if kept]
         values[name] = np.compress(varies, every, axis=number)
-        inner[name] = dict(zip(("coordinate", "point"), values[name].shape[: number : -1], strict=False))
+        inner[name] = dict(
+            zip(("coordinate", "point"), values[name].shape[:number:-1], strict=False)
+        )
     agree = len({tuple(sizes.items()) for sizes in inner.values()}) == 1
     variables = {
         name: (
@@ -317,7 +377,10 @@ def _seen_only(found, seen, axes, coords, nodes):
 
     `nodes`: labels of the last axis of some.
     """
-    variables, labels = {}, {_axis(name, "node", nodes): own for name, own in nodes.items() if name in found}
+    variables, labels = (
+        {},
+        {_axis(name, "node", nodes): own for name, own in nodes.items() if name in found},
+    )
     for name, values in found.items():
         last = [_axis(name, "node", nodes)] if name in nodes else []
         number = values.ndim - 2 - len(last)
@@ -329,27 +392,39 @@ def _seen_only(found, seen, axes, coords, nodes):
             variables[name] = (["chain", "draw", f"{name}_seen", *last], values[:, :, mask])
             for axis, size, places in zip(axes[name], mask.shape, np.nonzero(mask), strict=True):
                 label = axis.removeprefix(f"{name}_")
-                labels[f"{name}_{label}"] = (f"{name}_seen", np.asarray(coords.get(axis, range(size)))[places])
+                labels[f"{name}_{label}"] = (
+                    f"{name}_seen",
+                    np.asarray(coords.get(axis, range(size)))[places],
+                )
     return _dataset(variables, coords).assign_coords(labels)
 
 
 def _mapped(fn, samples, kept=None) -> dict:
-    """`fn` of every draw, or of those kept: chain by chain and a few draws at once, which bounds the memory."""
+    """`fn` of every draw, or of those kept: chain by chain and a few draws at once, which bounds
+    the memory.
+    """
     chains, draws = next(iter(samples.values())).shape[:2]
     number, kept = (draws, slice(None)) if kept is None else (len(kept), kept)
-    at_once = max(n for n in range(1, 9) if number % n == 0)  # a remainder would be compiled once more
+    # a remainder would be compiled once more
+    at_once = max(n for n in range(1, 9) if number % n == 0)
     program = jax.jit(lambda values: jax.lax.map(fn, values, batch_size=at_once))
-    done = [program({name: np.asarray(value[c])[kept] for name, value in samples.items()}) for c in range(chains)]
+    done = [
+        program({name: np.asarray(value[c])[kept] for name, value in samples.items()})
+        for c in range(chains)
+    ]
     return jax.tree.map(lambda *parts: np.stack(parts), *done)
 
 
 def _labelled(found, leading, kept, coords, branches):
-    """A dataset of the bridges and times of each site, with axes `(chain, draw, ..., time, point, coordinate)`.
+    """A dataset of the bridges and times of each site, with axes `(chain, draw, ..., time, point,
+    coordinate)`.
 
-    `branches`: labels of those of trees, which have the axes `branch` and `step` in place of `time`.
+    `branches`: labels of those of trees, which have the axes `branch` and `step` in place of
+    `time`.
     """
     grids = {
-        name: _grid(path[0, 0], times, len(leading[name]), branches.get(name)) for name, (path, times) in found.items()
+        name: _grid(path[0, 0], times, len(leading[name]), branches.get(name))
+        for name, (path, times) in found.items()
     }
     taken = set().union(*leading.values())
 
@@ -378,14 +453,22 @@ def _dataset(variables, coords):
     import xarray
 
     data = xarray.Dataset(variables)
-    given = {axis: coords[axis] for axis, size in data.sizes.items() if len(coords.get(axis, ())) == size}
+    given = {
+        axis: coords[axis] for axis, size in data.sizes.items() if len(coords.get(axis, ())) == size
+    }
     return data.assign_coords({axis: np.arange(size) for axis, size in data.sizes.items()} | given)
 
 
 def _grid(path, times, number, branches) -> dict:
-    """What two sites with a common axis agree in: its length, and the times if they do not vary with the draws."""
+    """What two sites with a common axis agree in: its length, and the times if they do not vary
+    with the draws.
+    """
     first = ("time",) if branches is None else ("branch", "step")
-    axes = (*first, "point", "coordinate") if path.ndim - number == len(first) + 2 else (*first, "coordinate")
+    axes = (
+        (*first, "point", "coordinate")
+        if path.ndim - number == len(first) + 2
+        else (*first, "coordinate")
+    )
     if branches is not None:
         return dict(zip(axes, path.shape[number:], strict=True)) | {"branch": tuple(branches)}
     fixed = {"time": tuple(times[0, 0])} if times.ndim == 3 and np.all(times == times[0, 0]) else {}
@@ -400,7 +483,9 @@ def _plainly(names) -> dict:
     """A dictionary with plain names; `ValueError` if two of them are the same."""
     plain = {_plain(name): value for name, value in names.items()}
     same = sorted(name for name in names if name != _plain(name) and _plain(name) in names)
-    require(not same, f"{same} become names of other sites, `/` being written `.`: rename these sites.")
+    require(
+        not same, f"{same} become names of other sites, `/` being written `.`: rename these sites."
+    )
     return plain
 
 
@@ -410,7 +495,9 @@ def _from_groups(groups, datasets, coords, dims):
 
     groups = {group: _plainly(values) for group, values in groups.items()}
     datasets = {
-        group: data.rename({name: _plain(name) for name in (*data.variables, *data.dims) if "/" in name})
+        group: data.rename(
+            {name: _plain(name) for name in (*data.variables, *data.dims) if "/" in name}
+        )
         for group, data in datasets.items()
         if data.data_vars
     }

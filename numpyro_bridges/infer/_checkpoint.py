@@ -2,13 +2,13 @@
 
 A directory holds NumPy archives,
 
-- `draws_<iteration>.npz`: what was kept of the interval that starts there, `(chains, draws, ...)`: samples as
-  `z/<site>`, extra fields under their names, thinned noise as `noise/<site>`;
-- `state.npz`: the number of iterations done, the states of the chains after them, as `state/<field>` (random keys as
-  their data), and the settings of the run.
+- `draws_<iteration>.npz`: what was kept of the interval that starts there, `(chains, draws, ...)`:
+  samples as `z/<site>`, extra fields under their names, thinned noise as `noise/<site>`;
+- `state.npz`: the number of iterations done, the states of the chains after them, as
+  `state/<field>` (random keys as their data), and the settings of the run.
 
-A file is written beside its place, synced, and moved there. Draws come first and the state commits them: draws from its
-iteration on belong to an interval that was cut off, and are written anew.
+A file is written beside its place, synced, and moved there. Draws come first and the state commits
+them: draws from its iteration on belong to an interval that was cut off, and are written anew.
 """
 
 import copy
@@ -48,53 +48,71 @@ def run_checkpointed(
     mesh: Mesh | None = None,
     **kwargs,
 ) -> None:
-    """`mcmc.run(rng_key, *args, ...)` in intervals that are saved; where a run was cut off, it goes on from there.
+    """`mcmc.run(rng_key, *args, ...)` in intervals that are saved; where a run was cut off, it goes
+    on from there.
 
-        run_checkpointed(mcmc, "wings_run", jax.random.key(0), wings)  # and after a crash: the same line again
+        run_checkpointed(mcmc, "wings_run", jax.random.key(0), wings)  # and after a crash: the same
+        line again
 
-    The draws are, bit for bit, those of a run that was never cut off, given the same machine, devices and versions.
-    Afterwards `mcmc` is as after `run`. The same call with a larger `num_samples` makes a chain longer. With thinning
-    by k, draws k, 2k, ... after the warm-up are kept.
+    The draws are, bit for bit, those of a run that was never cut off, given the same machine,
+    devices and versions. Afterwards `mcmc` is as after `run`. The same call with a larger
+    `num_samples` makes a chain longer. With thinning by k, draws k, 2k, ... after the warm-up are
+    kept.
 
     **Arguments:**
 
     - `mcmc`: of any kernel and chain method. A callable method is applied within `jax.jit`.
     - `path`: a directory, made if need be, for this run alone and for one process at a time.
     - `rng_key`, `args`, `kwargs`, `extra_fields`, `init_params`: as for `run`.
-    - `interval`: the number of iterations, warm-up included, between two savings: at most as many are lost to a kill.
-    - `mesh`: the devices that share the chains, as for `numpyro_bridges.spread`, of any kernel and in place of
-      `chain_method`. On another mesh a run goes on to rounding, not bit for bit. The processes of a mesh of several
-      call this together, with one `path` that all of them see; the first writes.
-    - `keep_noise`: by default the driving noise of the draws is dropped. With k > 1 every k-th draw's is kept, in
-      `mcmc.get_extra_fields()["noise"]`, for the bridges of `to_arviz`; with 1 it stays among the samples.
+    - `interval`: the number of iterations, warm-up included, between two savings: at most as many
+      are lost to a kill.
+    - `mesh`: the devices that share the chains, as for `numpyro_bridges.spread`, of any kernel and
+      in place of `chain_method`. On another mesh a run goes on to rounding, not bit for bit. The
+      processes of a mesh of several call this together, with one `path` that all of them see; the
+      first writes.
+    - `keep_noise`: by default the driving noise of the draws is dropped. With k > 1 every k-th
+      draw's is kept, in `mcmc.get_extra_fields()["noise"]`, for the bridges of `to_arviz`; with 1
+      it stays among the samples.
 
-    **Errors:** `ValueError` if `path` holds a run with other settings or arguments, or something else. Ctrl-C raises
-    `KeyboardInterrupt`, after `mcmc` has been given the draws of all complete intervals.
+    **Errors:** `ValueError` if `path` holds a run with other settings or arguments, or something
+    else. Ctrl-C raises `KeyboardInterrupt`, after `mcmc` has been given the draws of all complete
+    intervals.
 
-    A change of the model itself, or of what it takes from outside its arguments, shows only in how the chains start; it
-    leads to a warning.
+    A change of the model itself, or of what it takes from outside its arguments, shows only in how
+    the chains start; it leads to a warning.
     """
     require_instance(mcmc, MCMC, "mcmc", "an `MCMC` of NumPyro")
     require_key(rng_key, "rng_key", several=mcmc.num_chains > 1)
-    good = isinstance(extra_fields, (tuple, list)) and all(isinstance(name, str) for name in extra_fields)
+    good = isinstance(extra_fields, (tuple, list)) and all(
+        isinstance(name, str) for name in extra_fields
+    )
     require(good, f"`extra_fields` must be names of fields; got {words(extra_fields)}.")
     interval = positive_integer(interval, "interval")
     keep_noise = None if keep_noise is None else positive_integer(keep_noise, "keep_noise")
-    require(mcmc.post_warmup_state is None, "`mcmc` must do its own warm-up: set `mcmc.post_warmup_state` to None.")
+    require(
+        mcmc.post_warmup_state is None,
+        "`mcmc` must do its own warm-up: set `mcmc.post_warmup_state` to None.",
+    )
     folder = as_path(path, "path")
-    require(folder.is_dir() or not folder.exists(), f"`path` must be a directory, or a new name; {folder} is a file.")
+    require(
+        folder.is_dir() or not folder.exists(),
+        f"`path` must be a directory, or a new name; {folder} is a file.",
+    )
     require(
         mesh is None or mcmc.num_chains > 1,
-        f"`mesh` is for several chains, and `mcmc` has {mcmc.num_chains}: `MCMC(..., num_chains=8)`.",
+        f"`mesh` is for several chains, and `mcmc` has {mcmc.num_chains}: `MCMC(..., "
+        "num_chains=8)`.",
     )
     mesh_for(mcmc.num_chains, "`num_chains` of `mcmc`", mesh)
-    chains = _Chains(mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh)
+    chains = _Chains(
+        mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh
+    )
     state, done = _load_state(folder, chains)
     total = mcmc.num_warmup + mcmc.num_samples
     require(
         done <= total,
-        f"`num_samples` must be {done - mcmc.num_warmup} or more, as many as `path` {folder} holds; got "
-        f"{mcmc.num_samples}.",
+        f"`num_samples` must be {done - mcmc.num_warmup} or more, as many as `path` {folder} "
+        f"holds; got {mcmc.num_samples}.",
     )
     divergences = np.sum(_load_draws(folder, chains, done).get("diverging", 0))
     folder.mkdir(parents=True, exist_ok=True)
@@ -111,15 +129,18 @@ def run_checkpointed(
                 bar.update(stop - done)
                 done = stop
                 if not bar.disable:
-                    bar.set_description("warmup" if done < mcmc.num_warmup else "sample", refresh=False)
+                    bar.set_description(
+                        "warmup" if done < mcmc.num_warmup else "sample", refresh=False
+                    )
                     count = f"{divergences} divergences" if "diverging" in chains.fields else ""
                     bar.set_postfix_str(", ".join(filter(None, (chains.diagnostics(state), count))))
     except KeyboardInterrupt:
         state, done = _load_state(folder, chains)
         _hand_over(folder, chains, state, done)
         print(
-            f"Interrupted: of {total} iterations {done} are in {folder}, and of {mcmc.num_samples} draws "
-            f"{max(done - mcmc.num_warmup, 0)} (before thinning) in `mcmc`. The same call goes on from there.",
+            f"Interrupted: of {total} iterations {done} are in {folder}, and of "
+            f"{mcmc.num_samples} draws {max(done - mcmc.num_warmup, 0)} (before thinning) in "
+            "`mcmc`. The same call goes on from there.",
             file=sys.stderr,
         )
         raise
@@ -130,26 +151,38 @@ def run_checkpointed(
 class _Chains:
     """The chains of an `MCMC`, advanced by any number of iterations with one compiled program."""
 
-    def __init__(self, mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh):
+    def __init__(
+        self, mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh
+    ):
         self.mcmc, self.args, self.kwargs, self.interval = mcmc, args, kwargs, interval
         self.sampler = copy.copy(mcmc.sampler)  # `init` leaves functions in it
         names = dict.fromkeys([mcmc._sample_field, *mcmc._default_fields, *extra_fields])
         self.fields = [name for name in names if not name.startswith("~")]
-        self.removed = {name.removeprefix(f"~{mcmc._sample_field}.") for name in names if name.startswith("~")}
+        self.removed = {
+            name.removeprefix(f"~{mcmc._sample_field}.") for name in names if name.startswith("~")
+        }
         self.noise = () if keep_noise == 1 else _noise_of(self.sampler, args, kwargs)
         self.keep_noise = keep_noise
         self.batched = mcmc.num_chains > 1 and mcmc.chain_method == "vectorized" and mesh is None
         self.mesh = mesh or getattr(mcmc.sampler, "_mesh", None)
 
-        keys = jr.split(rng_key, mcmc.num_chains) if mcmc.num_chains > 1 and is_prng_key(rng_key) else rng_key
-        init = _over_chains(mcmc, mesh, lambda x, _: self.sampler.init(x[0], mcmc.num_warmup, x[1], args, kwargs))
+        keys = (
+            jr.split(rng_key, mcmc.num_chains)
+            if mcmc.num_chains > 1 and is_prng_key(rng_key)
+            else rng_key
+        )
+        init = _over_chains(
+            mcmc, mesh, lambda x, _: self.sampler.init(x[0], mcmc.num_warmup, x[1], args, kwargs)
+        )
         start = jax.tree.map(_array, init((keys, jax.tree.map(jnp.asarray, init_params)), ()))
         self.start = _rebuilt(_named(gather(_plain(start))), start)
         for name in self.fields:
             _require_field(self._first(self.start), name)
         leaves = jax.tree.leaves(_plain(self.start))
         self.fingerprint = np.array([np.sum(np.abs(x), dtype=float) for x in leaves])
-        self.draw = jax.eval_shape(self._collect, self.start if self.batched else self._first(self.start))
+        self.draw = jax.eval_shape(
+            self._collect, self.start if self.batched else self._first(self.start)
+        )
         self._program = _over_chains(mcmc, mesh, self._advance, jax.jit)
 
         method = "mesh" if mesh else getattr(mcmc.chain_method, "__name__", mcmc.chain_method)
@@ -169,7 +202,9 @@ class _Chains:
         }
 
     def advance(self, state, begin, end):
-        """The state after iteration `end`, and what is kept since `begin`: arrays `(chains, draws, ...)` by name."""
+        """The state after iteration `end`, and what is kept since `begin`: arrays `(chains, draws,
+        ...)` by name.
+        """
         state, draws = self._program(state, (begin, end))
         named, draws = gather((_named(_plain(state)), draws))
         kept = {}
@@ -181,7 +216,11 @@ class _Chains:
 
     def record(self, state, done):
         """What `state.npz` holds."""
-        header = {"iterations": done, "settings": json.dumps(self.settings), "start": self.fingerprint}
+        header = {
+            "iterations": done,
+            "settings": json.dumps(self.settings),
+            "start": self.fingerprint,
+        }
         return header | _named({"state": _plain(state)})
 
     def count(self, name, i):
@@ -201,7 +240,9 @@ class _Chains:
         """The fields of a draw, as `MCMC` has them, and the noise apart."""
         fields = {name: nested_attrgetter(name)(state) for name in self.fields}
         constrain = self.mcmc.postprocess_fn or self.sampler.postprocess_fn(self.args, self.kwargs)
-        samples = (jax.vmap(constrain) if self.batched else constrain)(fields[self.mcmc._sample_field])
+        samples = (jax.vmap(constrain) if self.batched else constrain)(
+            fields[self.mcmc._sample_field]
+        )
         if isinstance(samples, dict):
             if self.keep_noise and self.noise:
                 fields["noise"] = {k: v for k, v in samples.items() if k in self.noise}
@@ -209,9 +250,14 @@ class _Chains:
         return _plain(jax.tree.map(_array, fields | {self.mcmc._sample_field: samples}))
 
     def _advance(self, state, bounds):
-        """Iterations of one chain, or of a vectorised batch, between two numbers that are known only when it runs."""
+        """Iterations of one chain, or of a vectorised batch, between two numbers that are known
+        only when it runs.
+        """
         begin, end = bounds
-        empty = {k: jnp.zeros(x.shape, x.dtype) for k, x in _named(jax.eval_shape(self._collect, state)).items()}
+        empty = {
+            k: jnp.zeros(x.shape, x.dtype)
+            for k, x in _named(jax.eval_shape(self._collect, state)).items()
+        }
         sizes = {name: self.count(name, self.mcmc.num_warmup + self.interval) + 1 for name in empty}
 
         def step(i, carry):
@@ -221,8 +267,13 @@ class _Chains:
             def is_kept(name):
                 return self.count(name, i + 1) > self.count(name, i)
 
-            draw = jax.lax.cond(is_kept(""), lambda state: _named(self._collect(state)), lambda _: empty, state)
-            places = {k: jnp.where(is_kept(k), self.count(k, i) - self.count(k, begin), sizes[k]) for k in draw}
+            draw = jax.lax.cond(
+                is_kept(""), lambda state: _named(self._collect(state)), lambda _: empty, state
+            )
+            places = {
+                k: jnp.where(is_kept(k), self.count(k, i) - self.count(k, begin), sizes[k])
+                for k in draw
+            }
             return state, {k: draws[k].at[places[k]].set(draw[k], mode="drop") for k in draw}
 
         draws = {k: jnp.zeros((sizes[k], *x.shape), x.dtype) for k, x in empty.items()}
@@ -230,7 +281,9 @@ class _Chains:
 
 
 def _over_chains(mcmc, mesh, fn, jit=lambda fn: fn):
-    """`fn(x, common)`, x being of one chain, for all chains: on the devices of a mesh, or by the method of `mcmc`."""
+    """`fn(x, common)`, x being of one chain, for all chains: on the devices of a mesh, or by the
+    method of `mcmc`.
+    """
     method = mcmc.chain_method
     if mesh is None and (mcmc.num_chains == 1 or method == "vectorized"):
         return jit(fn)
@@ -247,7 +300,9 @@ def _require_field(state, name) -> None:
         nested_attrgetter(name)(state)
     except (AttributeError, IndexError, KeyError, TypeError) as e:
         known = ", ".join(getattr(state, "_fields", ()))
-        raise ValueError(f"`extra_fields` must be names of fields, of {known}; got {name!r}.") from e
+        raise ValueError(
+            f"`extra_fields` must be names of fields, of {known}; got {name!r}."
+        ) from e
 
 
 def _chain(x, c):
@@ -275,7 +330,10 @@ def _plain(tree):
 
 def _named(tree) -> dict:
     """Leaves by their paths."""
-    return {keystr(path, simple=True, separator="/"): leaf for path, leaf in tree_flatten_with_path(tree)[0]}
+    return {
+        keystr(path, simple=True, separator="/"): leaf
+        for path, leaf in tree_flatten_with_path(tree)[0]
+    }
 
 
 def _rebuilt(arrays, like):
@@ -291,18 +349,28 @@ def _rebuilt(arrays, like):
 def _settings_of(kernel, name) -> dict:
     """The numbers and switches of a kernel, and of its blocks."""
     numbers = {k: v for k, v in vars(kernel).items() if isinstance(v, bool | int | float | str)}
-    settings = {name: type(kernel).__name__} | {f"{name}.{k.lstrip('_')}": v for k, v in numbers.items()}
+    settings = {name: type(kernel).__name__} | {
+        f"{name}.{k.lstrip('_')}": v for k, v in numbers.items()
+    }
     for i, block in enumerate(getattr(kernel, "_kernels", ())):
         settings |= _settings_of(block, f"{name}.blocks.{i}")
     return settings
 
 
 def _described(x) -> str:
-    """A value that a file can hold: short ones in full, others by a hash; of what is no array, the type."""
+    """A value that a file can hold: short ones in full, others by a hash; of what is no array, the
+    type.
+    """
     if not hasattr(x, "dtype"):
-        return repr(x) if isinstance(x, bool | int | float | complex | str) else type(x).__qualname__
+        return (
+            repr(x) if isinstance(x, bool | int | float | complex | str) else type(x).__qualname__
+        )
     data = np.asarray(jr.key_data(x) if _is_key(x) else x)
-    value = data.tolist() if data.size <= 8 else f"with SHA-256 {hashlib.sha256(data.tobytes()).hexdigest()[:12]}"
+    value = (
+        data.tolist()
+        if data.size <= 8
+        else f"with SHA-256 {hashlib.sha256(data.tobytes()).hexdigest()[:12]}"
+    )
     return f"{x.dtype}{list(x.shape)} {value}"
 
 
@@ -319,7 +387,9 @@ def _read(file) -> dict:
         with open(file, "rb") as f, np.load(f, allow_pickle=False) as arrays:
             return dict(arrays)
     except (BadZipFile, EOFError, TypeError, ValueError) as e:
-        raise ValueError(f"`path` holds a {file.name} that cannot be read, {file}. Choose another path.") from e
+        raise ValueError(
+            f"`path` holds a {file.name} that cannot be read, {file}. Choose another path."
+        ) from e
 
 
 def _load_state(folder, chains):
@@ -328,21 +398,27 @@ def _load_state(folder, chains):
     if not file.exists():
         return chains.start, 0
     stored = _read(file)
-    require({"iterations", "settings", "start"} <= set(stored), f"{file} is of another program. Choose another `path`.")
+    require(
+        {"iterations", "settings", "start"} <= set(stored),
+        f"{file} is of another program. Choose another `path`.",
+    )
     old, new = json.loads(str(stored["settings"])), chains.settings
     for name in dict.fromkeys([*new, *old]):
         require(
             old.get(name) == new.get(name),
-            f"`path` {folder} holds a run with another {name}: {old.get(name)} there, {new.get(name)} in this call. "
-            "Choose another path, or go back to the old setting.",
+            f"`path` {folder} holds a run with another {name}: {old.get(name)} there, "
+            f"{new.get(name)} in this call. Choose another path, or go back to the old setting.",
         )
     if not np.allclose(stored["start"], chains.fingerprint, rtol=1e-5):
         warnings.warn(
-            f"the chains of `path` {folder} started elsewhere than this call would start them: the model, data that it "
-            "takes from outside its arguments, or a version has changed. If it is the model, choose another path.",
+            f"the chains of `path` {folder} started elsewhere than this call would start them: "
+            "the model, data that it takes from outside its arguments, or a version has changed. "
+            "If it is the model, choose another path.",
             stacklevel=3,
         )
-    state = {name.removeprefix("state/"): x for name, x in stored.items() if name.startswith("state/")}
+    state = {
+        name.removeprefix("state/"): x for name, x in stored.items() if name.startswith("state/")
+    }
     return _rebuilt(state, chains.start), int(stored["iterations"])
 
 
@@ -350,11 +426,22 @@ def _load_draws(folder, chains, done) -> dict:
     """The draws of the intervals before `done`, by name; none before the end of the warm-up."""
     if not (expected := chains.count("", done)):
         return {}
-    files = [file for file in sorted(folder.glob("draws_*.npz")) if int(file.stem.removeprefix("draws_")) < done]
+    files = [
+        file
+        for file in sorted(folder.glob("draws_*.npz"))
+        if int(file.stem.removeprefix("draws_")) < done
+    ]
     parts = [_read(file) for file in files]
-    draws = {name: np.concatenate([part[name] for part in parts], 1) for name in _named(chains.draw)} if parts else {}
+    draws = (
+        {name: np.concatenate([part[name] for part in parts], 1) for name in _named(chains.draw)}
+        if parts
+        else {}
+    )
     found = next(iter(draws.values())).shape[1] if draws else 0
-    require(found == expected, f"`path` {folder} lacks draws: {found} of {expected} are there. Choose another path.")
+    require(
+        found == expected,
+        f"`path` {folder} lacks draws: {found} of {expected} are there. Choose another path.",
+    )
     return draws
 
 

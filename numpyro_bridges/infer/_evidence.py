@@ -1,17 +1,20 @@
-"""The evidence of laws whose weights vary too much for importance sampling: trees, and models with priors.
+"""The evidence of laws whose weights vary too much for importance sampling: trees, and models with
+priors.
 
 Of a model with parameters θ, driving noise z and likelihood p(v | θ, z),
 
     Z(β) = ∫ p(θ) N(z; 0, I) p(v | θ, z)^β dθ dz,    Z(0) = 1,    Z(1) = p(v).
 
-Tempered distributions are moved by Hamiltonian Monte Carlo on function space, which keeps N(0, I) exactly at every β.
-The temperatures, the step sizes and the reference of the parameters are those that a pilot run has found; what follows
-takes them as given. Two estimates of log Z(1), in opposite directions:
+Tempered distributions are moved by Hamiltonian Monte Carlo on function space, which keeps N(0, I)
+exactly at every β. The temperatures, the step sizes and the reference of the parameters are those
+that a pilot run has found; what follows takes them as given. Two estimates of log Z(1), in opposite
+directions:
 
-- "smc": particles from the prior, reweighted by p(v | θ, z)^Δβ, resampled and moved [@delmoral2006]. The product of
-  the mean weights is unbiased, for any moves and any number of particles, since the schedule is fixed.
-- "bridge": chains from the posterior down to the prior. The ratios Z(β') / Z(β) are those of bridge sampling between
-  neighbours [@meng1996], with the draws of all chains.
+- "smc": particles from the prior, reweighted by p(v | θ, z)^Δβ, resampled and moved
+  [@delmoral2006]. The product of the mean weights is unbiased, for any moves and any number of
+  particles, since the schedule is fixed.
+- "bridge": chains from the posterior down to the prior. The ratios Z(β') / Z(β) are those of bridge
+  sampling between neighbours [@meng1996], with the draws of all chains.
 """
 
 import math
@@ -33,7 +36,15 @@ from numpyro import handlers
 from numpyro.distributions import biject_to
 from tqdm.auto import tqdm
 
-from .._checks import choice, flag, positive_integer, require, require_instance, require_key, require_mapping
+from .._checks import (
+    choice,
+    flag,
+    positive_integer,
+    require,
+    require_instance,
+    require_key,
+    require_mapping,
+)
 from .._devices import gather, mesh_for, spread
 from ..distributions import AbstractNoiseDriven, sample
 from ..weights import log_mean_exp
@@ -54,12 +65,13 @@ _LEAST_CHANGE = 1e-4
 class TemperedEvidence(eqx.Module):
     """An estimate of a log evidence. `str` of it says whether it is to be trusted, and if not, why.
 
-    - `log_evidence`, `standard_error`: in nats. The error is that of independent repetitions within the run, so that
-      it holds whatever moves and draws have of autocorrelation; with 8 of them ± 2 errors cover about 92 %.
-    - `log_estimates`: `(num_islands,)`, what each repetition says: of "smc" its own log evidence, of "bridge" the
-      jackknife's pseudo-values, whose mean is the estimate.
-    - `inverse_temperatures`: β, `(T + 1,)`, from 0 to 1. `accept_prob`: `(T,)`, mean acceptance at each but the first,
-      in the pilot run.
+    - `log_evidence`, `standard_error`: in nats. The error is that of independent repetitions within
+      the run, so that it holds whatever moves and draws have of autocorrelation; with 8 of them ± 2
+      errors cover about 92 %.
+    - `log_estimates`: `(num_islands,)`, what each repetition says: of "smc" its own log evidence,
+      of "bridge" the jackknife's pseudo-values, whose mean is the estimate.
+    - `inverse_temperatures`: β, `(T + 1,)`, from 0 to 1. `accept_prob`: `(T,)`, mean acceptance at
+      each but the first, in the pilot run.
     - `num_particles`: particles of an island, or draws of a chain at each temperature.
     """
 
@@ -75,8 +87,9 @@ class TemperedEvidence(eqx.Module):
     def trusted(self) -> bool:
         """Whether `log_evidence` ± 2 `standard_error` can be taken at its word.
 
-        Both are finite, moves were accepted, and repetitions differ by less than 1.5 nats (SD): the mean of unbiased
-        estimates that differ by more rests on the largest. What no particle has found cannot be seen.
+        Both are finite, moves were accepted, and repetitions differ by less than 1.5 nats (SD): the
+        mean of unbiased estimates that differ by more rests on the largest. What no particle has
+        found cannot be seen.
         """
         return not self.doubt
 
@@ -84,7 +97,8 @@ class TemperedEvidence(eqx.Module):
     def doubt(self) -> str:
         """Why it is not to be trusted, in a few words; empty where it is."""
         if not bool(jnp.isfinite(self.log_evidence) & jnp.isfinite(self.standard_error)):
-            return f"the log evidence is {float(self.log_evidence):.2f} ± {float(self.standard_error):.2g}"
+            error = float(self.standard_error)
+            return f"the log evidence is {float(self.log_evidence):.2f} ± {error:.2g}"
         least = float(np.min(self.accept_prob))
         if least < 0.2:
             return f"moves are hardly accepted (mean {least:.2f} at one temperature)"
@@ -104,23 +118,31 @@ class TemperedEvidence(eqx.Module):
         return f"{found} ({self.method}, {of}, {count} temperatures, {rates}){verdict}"
 
 
-def estimate_tree_evidence(law: AbstractNoiseDriven, data, key: Array, **settings) -> TemperedEvidence:
-    """Estimate p(data) of a tree, or of any law with driving noise, at fixed parameters, by tempering.
+def estimate_tree_evidence(
+    law: AbstractNoiseDriven, data, key: Array, **settings
+) -> TemperedEvidence:
+    """Estimate p(data) of a tree, or of any law with driving noise, at fixed parameters, by
+    tempering.
 
-    For topologies, clocks and models to be compared, where the log weights of a law vary by more than 2 or 3 nats and
-    `estimate_evidence` cannot be trusted.
+    For topologies, clocks and models to be compared, where the log weights of a law vary by more
+    than 2 or 3 nats and `estimate_evidence` cannot be trusted.
 
         for name, tree in trees.items():
             law = nb.DiffusionTree(flow, x0, match, tree=tree, num_steps=10)
             print(name, nb.estimate_tree_evidence(law, tree.rows(shapes), jax.random.key(0)))
 
-    **Arguments:** `law`: a `DiffusionTree` or `DiffusionEndpoint`. `data`: shaped as the law. `settings`: as of
-    `estimate_model_evidence`.
+    **Arguments:** `law`: a `DiffusionTree` or `DiffusionEndpoint`. `data`: shaped as the law.
+    `settings`: as of `estimate_model_evidence`.
 
     **Returns:** a `TemperedEvidence`.
     """
-    require_instance(law, AbstractNoiseDriven, "law", "a law with driving noise, such as `DiffusionTree`")
-    require(data is not None, "`data` must be an array shaped as `law`; got None, which would be no data.")
+    require_instance(
+        law, AbstractNoiseDriven, "law", "a law with driving noise, such as `DiffusionTree`"
+    )
+    require(
+        data is not None,
+        "`data` must be an array shaped as `law`; got None, which would be no data.",
+    )
     return estimate_model_evidence(_observed, key, law, data, **settings)
 
 
@@ -144,16 +166,18 @@ def estimate_model_evidence(
     progress: bool = True,
     mesh: Mesh | None = None,
 ) -> TemperedEvidence:
-    """Estimate p(data) of a NumPyro model with driving noise, its parameters integrated over their priors.
+    """Estimate p(data) of a NumPyro model with driving noise, its parameters integrated over their
+    priors.
 
     **Arguments:**
 
-    - `model`, `model_args`, `model_kwargs`: a NumPyro model and what it is called with, data included. All that it
-      observes is its data, `numpyro.factor` too; priors must be proper, and latent sites continuous.
+    - `model`, `model_args`, `model_kwargs`: a NumPyro model and what it is called with, data
+      included. All that it observes is its data, `numpyro.factor` too; priors must be proper, and
+      latent sites continuous.
     - `method`: "smc" or "bridge", which share the pilot run and nothing else.
     - `num_particles`: of each island; of "bridge", the draws of each chain at each temperature.
-    - `num_islands`: independent repetitions, at least 2, or chains. More of them tell the standard error better; more
-      particles make each estimate better.
+    - `num_islands`: independent repetitions, at least 2, or chains. More of them tell the standard
+      error better; more particles make each estimate better.
     - `num_moves`: trajectories of each particle at each temperature, in "smc".
     - `batch_size`: particles that a device evaluates at once; memory is bounded by it.
     - `progress`: show a bar.
@@ -161,10 +185,12 @@ def estimate_model_evidence(
 
     **Returns:** a `TemperedEvidence`; NaN where the log density of a draw from the prior is NaN.
 
-    The time goes into gradients, in "smc" about temperatures · islands · particles · (1 + moves · steps of a
-    trajectory), and there are about as many temperatures as log weights have nats of SD.
+    The time goes into gradients, in "smc" about temperatures · islands · particles · (1 + moves ·
+    steps of a trajectory), and there are about as many temperatures as log weights have nats of SD.
     """
-    require(callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}.")
+    require(
+        callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}."
+    )
     require_key(key)
     require_mapping(model_kwargs, "model_kwargs")
     choice(method, "method", ("smc", "bridge"))
@@ -182,13 +208,20 @@ def estimate_model_evidence(
         particles, stages, rates = _pilot(run, key_pilot, num_particles, num_moves, bar)
         bar.total = bar.n + len(stages) * (num_islands if method == "smc" else 1)
         if method == "smc":
-            found = [_island(run, k, stages, num_particles, num_moves, bar) for k in jr.split(key, num_islands)]
+            found = [
+                _island(run, k, stages, num_particles, num_moves, bar)
+                for k in jr.split(key, num_islands)
+            ]
             estimates, log_evidence, error = _of_islands(jnp.stack(found))
         else:
             draws = _ladder(run, key, particles, stages, num_islands, num_particles, bar)
-            estimates, log_evidence, error = _of_ladder(draws, np.diff([0.0, *(float(s.beta) for s in stages)]))
+            estimates, log_evidence, error = _of_ladder(
+                draws, np.diff([0.0, *(float(s.beta) for s in stages)])
+            )
     betas = np.array([0.0, *(float(stage.beta) for stage in stages)])
-    return TemperedEvidence(log_evidence, error, estimates, betas, np.array(rates), num_particles, method)
+    return TemperedEvidence(
+        log_evidence, error, estimates, betas, np.array(rates), num_particles, method
+    )
 
 
 class _Particles(NamedTuple):
@@ -199,7 +232,9 @@ class _Particles(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """A temperature, the steps of a trajectory there, and the reference by which parameters are whitened."""
+    """A temperature, the steps of a trajectory there, and the reference by which parameters are
+    whitened.
+    """
 
     beta: Array
     num_steps: Array
@@ -211,7 +246,11 @@ class _Run:
 
     def __init__(self, model, model_args, model_kwargs, batch_size: int, mesh: Mesh | None):
         self._model, self._args, self._kwargs = model, model_args, model_kwargs
-        sites = {name: site for name, site in sites_of(model, model_args, model_kwargs).items() if is_latent(site)}
+        sites = {
+            name: site
+            for name, site in sites_of(model, model_args, model_kwargs).items()
+            if is_latent(site)
+        }
         _check_sites(sites)
         self._noise = {name for name, site in sites.items() if is_noise(site)}
         self._unravel = self._parts(_unconstrained(sites))[2]
@@ -239,20 +278,26 @@ class _Run:
         theta = jax.vmap(lambda z: self._parts(z)[0])(z)
         mean = jnp.mean(theta, 0)
         rest, start = theta - mean, Reference(mean, jnp.eye(mean.size, dtype=mean.dtype))
-        return if_finite(from_moments(mean, rest.T @ rest, len(theta)), start) if mean.size else start
+        return (
+            if_finite(from_moments(mean, rest.T @ rest, len(theta)), start) if mean.size else start
+        )
 
     def _start(self, keys) -> _Particles:
         """Draws from the prior."""
 
         def one(key):
-            trace = handlers.trace(handlers.seed(self._model, key)).get_trace(*self._args, **self._kwargs)
+            trace = handlers.trace(handlers.seed(self._model, key)).get_trace(
+                *self._args, **self._kwargs
+            )
             z = _unconstrained({name: site for name, site in trace.items() if is_latent(site)})
             return _Particles(z, self._evaluate(z)[1])
 
         return self._spread(one)(keys)
 
     def _move(self, particles: _Particles, key, stage: _Stage, num_moves: int):
-        """Every particle moved on its own: where it is, its mean acceptance, and log p(v | θ, z) after each move."""
+        """Every particle moved on its own: where it is, its mean acceptance, and log p(v | θ, z)
+        after each move.
+        """
 
         reference = stage.reference
 
@@ -275,7 +320,9 @@ class _Run:
                 turn = _LENGTH * jr.uniform(key_angle, (), value[0].dtype, 1 - _JITTER, 1 + _JITTER)
                 steps = jnp.where(still, 1, stage.num_steps)
                 angle = jnp.where(still, 0.0, turn / steps)
-                y, _, new, slope, work = trajectory(value_and_grad, x, p, value, gradient, angle, steps)
+                y, _, new, slope, work = trajectory(
+                    value_and_grad, x, p, value, gradient, angle, steps
+                )
                 rate, accept = metropolis(key_accept, new[0] - value[0] + work)
                 carry = choose(accept | still, (y, new, slope), carry)
                 return carry, (rate, carry[1][1])
@@ -299,17 +346,28 @@ def _unconstrained(sites) -> Sites:
 def _check_sites(sites) -> None:
     require(
         any(map(is_noise, sites.values())),
-        f"`model` must have driving noise; its latent sites are {sorted(sites)}. Observe a law with "
-        "`numpyro_bridges.sample`.",
+        f"`model` must have driving noise; its latent sites are {sorted(sites)}. Observe a law "
+        "with `numpyro_bridges.sample`.",
     )
     discrete = [name for name, site in sites.items() if site["fn"].support.is_discrete]
-    require(not discrete, f"`model` must have continuous latent sites; {discrete} are discrete: sum them out.")
-    improper = [name for name, site in sites.items() if isinstance(site["fn"], dist.ImproperUniform)]
-    require(not improper, f"`model` must have proper priors, or it has no evidence; those of {improper} are improper.")
+    require(
+        not discrete,
+        f"`model` must have continuous latent sites; {discrete} are discrete: sum them out.",
+    )
+    improper = [
+        name for name, site in sites.items() if isinstance(site["fn"], dist.ImproperUniform)
+    ]
+    require(
+        not improper,
+        f"`model` must have proper priors, or it has no evidence; those of {improper} are "
+        "improper.",
+    )
 
 
 def _resampled(particles: _Particles, key, change):
-    """Particles drawn in proportion to p(v | θ, z)^change, systematically, and the log of the mean weight."""
+    """Particles drawn in proportion to p(v | θ, z)^change, systematically, and the log of the mean
+    weight.
+    """
     log_weights = change * particles.log_likelihood
     count = log_weights.size
     edges = jnp.cumsum(jax.nn.softmax(log_weights))
@@ -319,7 +377,9 @@ def _resampled(particles: _Particles, key, change):
 
 
 def _pilot(run: _Run, key, num_particles, num_moves, bar):
-    """Particles of the posterior, and what a run needs to know: a stage for each temperature, and acceptances."""
+    """Particles of the posterior, and what a run needs to know: a stage for each temperature, and
+    acceptances.
+    """
     key, key_start = jr.split(key)
     particles = run.start(jr.split(key_start, num_particles))
     beta, step, stages, rates = 0.0, _LENGTH / 2, [], []
@@ -331,7 +391,9 @@ def _pilot(run: _Run, key, num_particles, num_moves, bar):
         stage = _Stage(jnp.asarray(beta), jnp.asarray(_num_steps(step)), run.fitted(particles.z))
         particles, accepted, _ = run.move(particles, key_move, stage, num_moves)
         rate = float(jnp.mean(accepted))
-        step = float(np.clip(step * np.exp(2 * (rate - _ACCEPTANCE)), _LENGTH / _MAX_STEPS, _LENGTH))
+        step = float(
+            np.clip(step * np.exp(2 * (rate - _ACCEPTANCE)), _LENGTH / _MAX_STEPS, _LENGTH)
+        )
         stages.append(stage._replace(num_steps=jnp.asarray(_num_steps(step))))
         rates.append(rate)
         bar.set_postfix(pilot=f"{beta:.3g}")
@@ -388,8 +450,8 @@ def _of_islands(estimates):
 def _ladder(run: _Run, key, particles, stages, num_chains, num_draws, bar):
     """log p(v | θ, z) of draws at every temperature, `(T + 1, chains, draws)`, from the prior on.
 
-    Chains start at particles of the posterior; at each temperature a quarter of the draws, at the first all of them,
-    is made before those that are kept.
+    Chains start at particles of the posterior; at each temperature a quarter of the draws, at the
+    first all of them, is made before those that are kept.
     """
     key, key_start, key_prior = jr.split(key, 3)
     chosen = jr.choice(key_start, len(particles.log_likelihood), (num_chains,), replace=False)
@@ -412,7 +474,9 @@ def _of_ladder(draws, changes):
 
     def estimate(kept):
         pairs = zip(changes, draws[:-1], draws[1:], strict=True)
-        return sum(_log_ratio(change * lower[kept], change * upper[kept]) for change, lower, upper in pairs)
+        return sum(
+            _log_ratio(change * lower[kept], change * upper[kept]) for change, lower, upper in pairs
+        )
 
     every = np.arange(chains)
     whole = estimate(every)
@@ -421,7 +485,7 @@ def _of_ladder(draws, changes):
 
 
 def _log_ratio(lower, upper) -> float:
-    """log Z' / Z by bridge sampling, from log weights q' / q of as many draws of each distribution."""
+    """log Z' / Z by bridge sampling, from log weights q' / q of equally many draws of each."""
     ratio = _log_mean(lower)
     for _ in range(200):
         old = ratio

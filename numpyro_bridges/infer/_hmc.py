@@ -6,9 +6,10 @@ With x = (y, z), y the parameters whitened by their reference, and standard norm
 
     H = Ψ(x) + ½ |x|² + ½ |p|²,    Ψ = -log p(θ, z | v) - ½ |x|².
 
-The Gaussian part is a rotation of (x, p) by the step ε, which is exact; Ψ acts by kicks, p ← p - ½ε ∇Ψ, before and
-after it. ½ |x|² + ½ |p|² never enters the acceptance: the energy's error is the change of Ψ plus the work of the kicks,
-which has a limit as the grid is refined, and so the same step is good on every grid.
+The Gaussian part is a rotation of (x, p) by the step ε, which is exact; Ψ acts by kicks, p ← p - ½ε
+∇Ψ, before and after it. ½ |x|² + ½ |p|² never enters the acceptance: the energy's error is the
+change of Ψ plus the work of the kicks, which has a limit as the grid is refined, and so the same
+step is good on every grid.
 """
 
 from typing import NamedTuple
@@ -30,7 +31,7 @@ _MAX_ENERGY_ERROR = 1000.0  # a transition above it is called divergent, as in N
 
 
 class AdaptState(NamedTuple):
-    """`step_size`: ε. `averaging`: of its dual averaging. `windows`: of the parameters' reference."""
+    """`step_size`: ε. `averaging`: its dual averaging. `windows`: of the parameters' reference."""
 
     step_size: Array
     averaging: tuple
@@ -40,10 +41,14 @@ class AdaptState(NamedTuple):
 class FunctionSpaceHMCState(NamedTuple):
     """State of `FunctionSpaceHMC`, under the names of NumPyro's `HMCState`.
 
-    - `z`: unconstrained values. `misfit`, `gradient`: Φ, minus the log density without the noise's prior.
-    - `potential_energy`: minus the log joint density. `energy`: with the kinetic energy of the accepted end.
-    - `num_steps`: gradients of this draw. `diverging`: the energy was NaN, or off by more than 1000.
-    - `seal`: by which a chain knows that it starts again, perhaps on other data, and renews its energies.
+    - `z`: unconstrained values. `misfit`, `gradient`: Φ, minus the log density without the noise's
+      prior.
+    - `potential_energy`: minus the log joint density. `energy`: with the kinetic energy of the
+      accepted end.
+    - `num_steps`: gradients of this draw. `diverging`: the energy was NaN, or off by more than
+      1000.
+    - `seal`: by which a chain knows that it starts again, perhaps on other data, and renews its
+      energies.
     """
 
     i: Array
@@ -68,17 +73,20 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
 
     **Arguments:**
 
-    - `model`: a NumPyro model with sites of driving noise. Its other latent sites are continuous parameters, with a
-      dense mass matrix that is adapted in the warm-up, and started at a Laplace approximation.
-    - `step_size`: ε, an angle, adapted in the warm-up unless `adapt_step_size=False`. It is never below
-      `trajectory_length / max_num_steps`: a smaller one is raised to that.
+    - `model`: a NumPyro model with sites of driving noise. Its other latent sites are continuous
+      parameters, with a dense mass matrix that is adapted in the warm-up, and started at a Laplace
+      approximation.
+    - `step_size`: ε, an angle, adapted in the warm-up unless `adapt_step_size=False`. It is never
+      below `trajectory_length / max_num_steps`: a smaller one is raised to that.
     - `target_accept_prob`: of that adaptation.
-    - `trajectory_length`: the angle by which the Gaussian part turns (π/2 forgets it), jittered by ± `jitter` of
-      itself. A draw takes `trajectory_length / step_size` gradients, rounded up.
+    - `trajectory_length`: the angle by which the Gaussian part turns (π/2 forgets it), jittered by
+      ± `jitter` of itself. A draw takes `trajectory_length / step_size` gradients, rounded up.
     - `max_num_steps`: bounds that number, adapted or not. The trajectory keeps its length.
-    - `init_strategy`: the noise starts at zero, the guided mean path; parameters at their prior medians, from where the
-      Laplace approximation is sought. Chains start at draws from it, or at `init_params`.
-    - `mesh`: the devices that share the chains of `chain_method="vectorized"`, as for `numpyro_bridges.spread`.
+    - `init_strategy`: the noise starts at zero, the guided mean path; parameters at their prior
+      medians, from where the Laplace approximation is sought. Chains start at draws from it, or at
+      `init_params`.
+    - `mesh`: the devices that share the chains of `chain_method="vectorized"`, as for
+      `numpyro_bridges.spread`.
     """
 
     def __init__(
@@ -113,7 +121,9 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         adapt = AdaptState(*start_step_size(step), start_windows(reference))
         energy = phi + half_square(self._parts(z)[1])
         i, zero, no = jnp.zeros((), int), jnp.zeros_like(phi), jnp.array(False)
-        return FunctionSpaceHMCState(i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key, UNSEALED)
+        return FunctionSpaceHMCState(
+            i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key, UNSEALED
+        )
 
     def _slopes(self, state):
         return state.gradient
@@ -125,7 +135,9 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
     def _refreshed(self, state, model_args, model_kwargs):
         phi, gradient = jax.value_and_grad(self._misfit)(state.z, model_args, model_kwargs)
         return state._replace(
-            misfit=phi, gradient=gradient, potential_energy=phi + half_square(self._parts(state.z)[1])
+            misfit=phi,
+            gradient=gradient,
+            potential_energy=phi + half_square(self._parts(state.z)[1]),
         )
 
     def _sample_one(self, state, still, model_args, model_kwargs):
@@ -144,16 +156,24 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         # Rounding may lift the quotient above its bound, and the step may come from another kernel.
         steps = jnp.ceil(self._length / state.adapt_state.step_size)
         steps = jnp.where(still, 1, jnp.clip(steps, 1, self._max_num_steps)).astype(int)
-        turn = jr.uniform(key_length, (), y.dtype, 1 - self._jitter, 1 + self._jitter) * self._length
+        turn = (
+            jr.uniform(key_length, (), y.dtype, 1 - self._jitter, 1 + self._jitter) * self._length
+        )
         angle = jnp.where(still, 0.0, turn / steps)
         x = (y, noise)
         old = state.misfit - half_square(y)
         gradient = reference.whiten_gradient(slope) - y, force
         p = normal_like(key_momentum, x)
-        x, p, new, (slope, force), work = trajectory(jax.value_and_grad(psi), x, p, old, gradient, angle, steps)
+        x, p, new, (slope, force), work = trajectory(
+            jax.value_and_grad(psi), x, p, old, gradient, angle, steps
+        )
         error = new - old + work
         rate, accept = metropolis(key_accept, error)
-        moved = to_sites(x), new + half_square(x[0]), unravel(reference.colour_gradient(slope + x[0])) | force
+        moved = (
+            to_sites(x),
+            new + half_square(x[0]),
+            unravel(reference.colour_gradient(slope + x[0])) | force,
+        )
         z, phi, gradient = choose(accept | still, moved, (state.z, state.misfit, state.gradient))
         potential = phi + half_square(self._parts(z)[1])
         return FunctionSpaceHMCState(
@@ -187,6 +207,8 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         step = StepSize(adapt.step_size, adapt.averaging)
         if self._adapt_step_size:
             last = state.i == self._num_warmup - 1
-            step = update_step_size(step, self._target - rate, self._step_bounds, renew=renewed, last=last)
+            step = update_step_size(
+                step, self._target - rate, self._step_bounds, renew=renewed, last=last
+            )
         new = AdaptState(*step, windows)
         return choose(self._warming(state), new, adapt)

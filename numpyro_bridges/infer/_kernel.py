@@ -1,4 +1,6 @@
-"""What the kernels share: they are NumPyro kernels of a model whose noise carries the `driving_noise` mark."""
+"""What the kernels share: they are NumPyro kernels of a model whose noise carries the
+`driving_noise` mark.
+"""
 
 import copy
 from abc import abstractmethod
@@ -47,13 +49,19 @@ UNSEALED: Any = np.uint32(0)  # of a state that is being made
 
 
 class AbstractBridgeKernel(MCMCKernel):
-    """A kernel of a model, written for one chain and mapped over several. Values in its state are unconstrained."""
+    """A kernel of a model, written for one chain and mapped over several. Values in its state are
+    unconstrained.
+    """
 
     def __init__(self, model, init_strategy=init_to_guided_mean, mesh: Mesh | None = None):
-        require(callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}.")
+        require(
+            callable(model),
+            f"`model` must be a NumPyro model, a callable; got {type(model).__name__}.",
+        )
         require(
             callable(init_strategy),
-            f"`init_strategy` must be a strategy such as `init_to_median`; got {words(init_strategy)}.",
+            "`init_strategy` must be a strategy such as `init_to_median`; got "
+            f"{words(init_strategy)}.",
         )
         require_mesh(mesh)
         self._model = model
@@ -106,7 +114,9 @@ class AbstractBridgeKernel(MCMCKernel):
         def one(key, init_params):
             key, key_start, key_reference = jr.split(key, 3)
             z = self._start(key_start, model_args, model_kwargs) | (init_params or {})
-            z, reference = self._near_the_mode(key_reference, z, init_params is not None, model_args, model_kwargs)
+            z, reference = self._near_the_mode(
+                key_reference, z, init_params is not None, model_args, model_kwargs
+            )
             state = self._init_one(key, z, reference, model_args, model_kwargs)
             return _sealed(state, _seal_of(model_args, model_kwargs))
 
@@ -115,14 +125,17 @@ class AbstractBridgeKernel(MCMCKernel):
         else:
             require(
                 self._mesh is None,
-                "`mesh` is for chains that run at once, and this is one: `MCMC(kernel, num_chains=8, "
-                'chain_method="vectorized")`. In `Gibbs`, and for `run_checkpointed`, leave it out of the kernel.',
+                "`mesh` is for chains that run at once, and this is one: `MCMC(kernel, "
+                'num_chains=8, chain_method="vectorized")`. In `Gibbs`, and for '
+                "`run_checkpointed`, leave it out of the kernel.",
             )
             over_chains = lambda fn: fn  # noqa: E731
 
         def sample(state, model_args, model_kwargs):
             seal = _seal_of(model_args, model_kwargs)
-            return over_chains(lambda state: self._next(state, seal, model_args, model_kwargs))(state)
+            return over_chains(lambda state: self._next(state, seal, model_args, model_kwargs))(
+                state
+            )
 
         self._sample_fn = sample
         state = jax.jit(over_chains(one))(rng_key, init_params)
@@ -140,7 +153,8 @@ class AbstractBridgeKernel(MCMCKernel):
         return _sealed(state, _seal_of(model_args, model_kwargs))
 
     def _next(self, state, seal, model_args, model_kwargs):
-        """The next state of one chain. Where the energies are stale, a move of no time renews them first.
+        """The next state of one chain. Where the energies are stale, a move of no time renews them
+        first.
 
         It is the program of the draw itself: another would have to be compiled, and a branch would
         be taken in every draw of chains under `jax.vmap`.
@@ -180,13 +194,17 @@ class AbstractBridgeKernel(MCMCKernel):
         sites = self._latent(0, init_to_sample, model_args, model_kwargs)
         name = type(self).__name__
         discrete = [k for k, site in sites.items() if site["fn"].support.is_discrete]
-        require(not discrete, f"{name} cannot draw the discrete sites {discrete}: give them a block of `Gibbs`.")
+        require(
+            not discrete,
+            f"{name} cannot draw the discrete sites {discrete}: give them a block of `Gibbs`.",
+        )
         self._noise = tuple(sorted(k for k, site in sites.items() if is_noise(site)))
         self._blocks = {k: sites[k]["infer"].get("blocks") for k in self._noise}
         require(
             bool(self._noise),
-            f"{name} found no driving noise among the latent sites {sorted(sites)}: observe a law with "
-            "`numpyro_bridges.sample`, or mark the noise's site by `infer={'driving_noise': True}`.",
+            f"{name} found no driving noise among the latent sites {sorted(sites)}: observe a law "
+            "with `numpyro_bridges.sample`, or mark the noise's site by `infer={'driving_noise': "
+            "True}`.",
         )
         others = model_kwargs.get(GIBBS_SITES_KWARG)
         if others and set(sites) != set(self._noise):
@@ -204,11 +222,14 @@ class AbstractBridgeKernel(MCMCKernel):
         moving = supports_that_move(given, others)
         require(
             not moving,
-            f"the supports of the sites {moving} depend on sites of other blocks of `Gibbs`: make them one block.",
+            f"the supports of the sites {moving} depend on sites of other blocks of `Gibbs`: make "
+            "them one block.",
         )
 
     def _check_start(self, state, num_chains, model_args, model_kwargs):
-        """The energy, and the gradient if the kernel follows it, are finite where each chain starts."""
+        """The energy, and the gradient if the kernel follows it, are finite where each chain
+        starts.
+        """
         slopes = jax.tree.leaves(self._slopes(state))
         known = [x for x in map(concrete, (state.potential_energy, *slopes)) if x is not None]
         if len(known) <= len(slopes):  # some are traced
@@ -237,9 +258,13 @@ class AbstractBridgeKernel(MCMCKernel):
         return {k: biject_to(site["fn"].support).inv(site["value"]) for k, site in sites.items()}
 
     def _near_the_mode(self, key, z, stay, model_args, model_kwargs):
-        """A Laplace approximation of the parameters' posterior, and a start drawn from it unless one was given."""
+        """A Laplace approximation of the parameters' posterior, and a start drawn from it unless
+        one was given.
+        """
         theta, noise, unravel = self._parts(z)
-        reference = laplace(lambda theta: self._misfit(unravel(theta) | noise, model_args, model_kwargs), theta)
+        reference = laplace(
+            lambda theta: self._misfit(unravel(theta) | noise, model_args, model_kwargs), theta
+        )
         start = theta if stay else reference.colour(jr.normal(key, theta.shape, theta.dtype))
         return unravel(start) | noise, reference
 
@@ -263,7 +288,9 @@ class AbstractBridgeKernel(MCMCKernel):
 
 
 def _seal_of(model_args, model_kwargs):
-    """Of what the model is given, but for the values of other blocks of `Gibbs`, which tells when they change."""
+    """Of what the model is given, but for the values of other blocks of `Gibbs`, which tells when
+    they change.
+    """
     kwargs = {name: x for name, x in (model_kwargs or {}).items() if name != GIBBS_SITES_KWARG}
     return of_arguments((tuple(model_args), kwargs))
 
@@ -274,9 +301,15 @@ def _sealed(state, seal):
 
 def _starts(values, sites, constrained: bool, num_chains: int | None) -> Sites:
     """`init_params` as unconstrained arrays, chains in front."""
-    require(isinstance(values, Mapping), f"`init_params` must be a dictionary by sites; got {words(values)}.")
+    require(
+        isinstance(values, Mapping),
+        f"`init_params` must be a dictionary by sites; got {words(values)}.",
+    )
     unknown = sorted(set(values) - set(sites))
-    require(not unknown, f"`init_params` has values for {unknown}; the latent sites are {sorted(sites)}.")
+    require(
+        not unknown,
+        f"`init_params` has values for {unknown}; the latent sites are {sorted(sites)}.",
+    )
     chains = () if num_chains is None else (num_chains,)
     starts = {}
     for name, value in values.items():
@@ -285,8 +318,9 @@ def _starts(values, sites, constrained: bool, num_chains: int | None) -> Sites:
         x = as_float(value, f"init_params['{name}']")
         require(
             x.shape == shape,
-            f"`init_params['{name}']` must have shape {shape}, {'' if constrained else 'un'}constrained"
-            f"{', chains in front' if chains else ''}; got {x.shape}.",
+            f"`init_params['{name}']` must have shape {shape}, "
+            f"{'' if constrained else 'un'}constrained{', chains in front' if chains else ''}; "
+            f"got {x.shape}.",
         )
         starts[name] = transform.inv(x) if constrained else x
     return starts

@@ -6,15 +6,17 @@ A move turns the noise z by an angle φ towards an independent p ~ N(0, I),
 
     z' = cos(φ) z + sin(φ) p,
 
-which N(0, I) survives, and is accepted on the likelihood ratio alone: the rate does not depend on the grid. `PCNL`, the
-Langevin version, also kicks p by the gradient of the log likelihood, for half of φ before the turn and half of φ after.
+which N(0, I) survives, and is accepted on the likelihood ratio alone: the rate does not depend on
+the grid. `PCNL`, the Langevin version, also kicks p by the gradient of the log likelihood, for half
+of φ before the turn and half of φ after.
 
-Data that are independent given the parameters, each with its own noise, move at once and are accepted one by one: one
-evaluation of the model updates them all, and each has its own angle.
+Data that are independent given the parameters, each with its own noise, move at once and are
+accepted one by one: one evaluation of the model updates them all, and each has its own angle.
 
-So do the clades of a tree, given the noise before them: Ψ is a sum over the branches, and the noise of a branch enters
-its own term and those below it. A move turns the noise of all branches of one level, those that are as many branches
-from the root, or of all that is below them too; each is accepted on what changes in its clade.
+So do the clades of a tree, given the noise before them: Ψ is a sum over the branches, and the noise
+of a branch enters its own term and those below it. A move turns the noise of all branches of one
+level, those that are as many branches from the root, or of all that is below them too; each is
+accepted on what changes in its clade.
 """
 
 from abc import ABC, abstractmethod
@@ -38,12 +40,15 @@ from ._rotation import half_square, kick, metropolis, normal_like, rotate, total
 class PCNState(NamedTuple):
     """State of `PCN` and `PCNL`.
 
-    - `z`: the noise. `potential_energy`: minus the log joint density, up to what does not depend on the noise.
-    - `energies`: -log p(v_s | θ, z_s), an array for each noise site; one number where data share noise, or where it has
-      other uses. With `blocks` those of a tree have an axis for its branches behind. `force`: minus their gradient, in
-      `PCNL`.
-    - `angles`: φ, shaped as `energies`, adapted in the warm-up. `accept_prob`: the mean over data and moves.
-    - `diverging`: an energy was NaN. `seal`: by which a chain knows that it starts again, perhaps on other data.
+    - `z`: the noise. `potential_energy`: minus the log joint density, up to what does not depend on
+      the noise.
+    - `energies`: -log p(v_s | θ, z_s), an array for each noise site; one number where data share
+      noise, or where it has other uses. With `blocks` those of a tree have an axis for its branches
+      behind. `force`: minus their gradient, in `PCNL`.
+    - `angles`: φ, shaped as `energies`, adapted in the warm-up. `accept_prob`: the mean over data
+      and moves.
+    - `diverging`: an energy was NaN. `seal`: by which a chain knows that it starts again, perhaps
+      on other data.
     """
 
     i: Array
@@ -83,7 +88,8 @@ class AbstractPCN(AbstractBridgeKernel):
         self._kind = None if blocks is None else choice(blocks, "blocks", ("branch", "clade"))
         require(
             self._kind is None or self._num_blocks == 1,
-            f"`num_blocks` cuts time steps, and `blocks` a tree; got {num_blocks} and {blocks!r}. Give one of them.",
+            f"`num_blocks` cuts time steps, and `blocks` a tree; got {num_blocks} and {blocks!r}. "
+            "Give one of them.",
         )
         self._cuts: list[AbstractBlocks] = []
 
@@ -92,27 +98,37 @@ class AbstractPCN(AbstractBridgeKernel):
         """Energies, and the force on the noise; an empty one, if the energies alone decide."""
 
     def _energies_of(self, z, model_args, model_kwargs):
-        return energies_of(self._model, model_args, model_kwargs, z, self._owners, self._kind is not None)[1]
+        return energies_of(
+            self._model, model_args, model_kwargs, z, self._owners, self._kind is not None
+        )[1]
 
     def get_diagnostics_str(self, state):
-        angles = jnp.concatenate([jnp.ravel(angle) for angle in state.angles])
-        return f"mean angle {float(jnp.mean(angles)):.2f}. acc. prob={float(state.mean_accept_prob):.2f}"
+        angles = jnp.concatenate([jnp.ravel(some) for some in state.angles])
+        angle = float(jnp.mean(angles))
+        return f"mean angle {angle:.2f}. acc. prob={float(state.mean_accept_prob):.2f}"
 
     def _init_one(self, key, z, reference, model_args, model_kwargs):
         parameters = sorted(set(z) - set(self._noise))
         require(
             not parameters,
-            f"{type(self).__name__} moves noise alone, and the model has parameters, {parameters}: give them a block, "
-            f"`Gibbs([({type(self).__name__}(model), noise_sites), (NUTS(model), None)])`.",
+            f"{type(self).__name__} moves noise alone, and the model has parameters, "
+            f"{parameters}: give them a block, `Gibbs([({type(self).__name__}(model), "
+            "noise_sites), (NUTS(model), None)])`.",
         )
-        few = [name for name in z if self._num_blocks > (z[name].shape[-3] if z[name].ndim > 2 else 1)]
-        require(not few, f"`num_blocks` must be at most the number of time steps; {few} have fewer.")
+        few = [
+            name for name in z if self._num_blocks > (z[name].shape[-3] if z[name].ndim > 2 else 1)
+        ]
+        require(
+            not few, f"`num_blocks` must be at most the number of time steps; {few} have fewer."
+        )
         self._owners = driven_by(self._model, model_args, model_kwargs, z)
         self._cuts = self._cut(z)
         energies, force = self._evaluate(z, model_args, model_kwargs)
         angles = tuple(jnp.full_like(energy, self._angle) for energy in energies)
         i, zero, no = jnp.array(0), jnp.zeros_like(total(energies)), jnp.array(False)
-        return PCNState(i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key, UNSEALED)
+        return PCNState(
+            i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key, UNSEALED
+        )
 
     def _cut(self, z) -> "list[AbstractBlocks]":
         """How the noise of each group is cut."""
@@ -120,14 +136,19 @@ class AbstractPCN(AbstractBridgeKernel):
             return [_TimeBlocks(self._num_blocks)] * len(groups_of(z, self._owners))
         require(
             any(blocks is not None for blocks in self._blocks.values()),
-            f"`blocks` needs the noise of a `DiffusionTree`, of `numpyro_bridges.sample`; {sorted(z)} have none.",
+            "`blocks` needs the noise of a `DiffusionTree`, of `numpyro_bridges.sample`; "
+            f"{sorted(z)} have none.",
         )
         require(
             self._owners is not None,
-            f"`blocks` needs noise that drives one site and has no other use; {sorted(z)} are not so.",
+            f"`blocks` needs noise that drives one site and has no other use; {sorted(z)} are not "
+            "so.",
         )
         cuts = [self._blocks[name] for name in sorted(z)]
-        return [_TimeBlocks(1) if cut is None else _TreeBlocks(cut, self._kind == "clade") for cut in cuts]
+        return [
+            _TimeBlocks(1) if cut is None else _TreeBlocks(cut, self._kind == "clade")
+            for cut in cuts
+        ]
 
     @property
     def _energies(self):
@@ -135,14 +156,18 @@ class AbstractPCN(AbstractBridgeKernel):
 
     def _refreshed(self, state, model_args, model_kwargs):
         energies, force = self._evaluate(state.z, model_args, model_kwargs)
-        return state._replace(potential_energy=_potential(state.z, energies), energies=energies, force=force)
+        return state._replace(
+            potential_energy=_potential(state.z, energies), energies=energies, force=force
+        )
 
     def _sample_one(self, state, still, model_args, model_kwargs):
         key, key_moves = jr.split(state.rng_key)
 
         def move(m, carry):
             state, rates = carry
-            state, rate = self._move(jr.fold_in(key_moves, m), m, state, still, model_args, model_kwargs)
+            state, rate = self._move(
+                jr.fold_in(key_moves, m), m, state, still, model_args, model_kwargs
+            )
             return state, rates + rate / self._num_moves
 
         start = (state._replace(diverging=jnp.array(False)), jnp.zeros_like(state.accept_prob))
@@ -156,7 +181,9 @@ class AbstractPCN(AbstractBridgeKernel):
         )
 
     def _move(self, key, m, state, still, model_args, model_kwargs):
-        """Turns the noise of one block of time steps, or of one level of a tree, and decides for each datum."""
+        """Turns the noise of one block of time steps, or of one level of a tree, and decides for
+        each datum.
+        """
         key_p, key_accept = jr.split(key)
         old, groups = state.z, groups_of(state.z, self._owners)
         number = state.i * self._num_moves + m
@@ -172,9 +199,16 @@ class AbstractPCN(AbstractBridgeKernel):
 
         accept, decisions, rates, asked = {}, [], [], []
         for key, group, cut, e_new, e_old in zip(
-            jr.split(key_accept, len(groups)), groups, self._cuts, energies, state.energies, strict=True
+            jr.split(key_accept, len(groups)),
+            groups,
+            self._cuts,
+            energies,
+            state.energies,
+            strict=True,
         ):
-            work = sum(cut.summed(before[name] + after[name], e_new) for name in group if name in force)
+            work = sum(
+                cut.summed(before[name] + after[name], e_new) for name in group if name in force
+            )
             rate, decision = metropolis(key, cut.judged(number, e_new - e_old + work))
             accepted = cut.applied(number, decision) | still
             accept |= {name: cut.widened(accepted, old[name]) for name in group}
@@ -198,7 +232,7 @@ class AbstractPCN(AbstractBridgeKernel):
         return state, total(rates) / total(asked)
 
     def _adapted(self, state, angle: Array, rate: Array) -> Array:
-        """Robbins-Monro: the rate tends to its target, or stays above it at the largest angle, π/2."""
+        """Robbins-Monro: the rate tends to its target, or stays above it at the angle π/2."""
         if not self._adapt_angle:
             return angle
         gain = (state.i + 1.0) ** -0.6
@@ -216,15 +250,17 @@ class PCN(AbstractPCN):
 
     **Arguments:**
 
-    - `model`: a NumPyro model with sites of driving noise, and no other latent sites but those of other blocks.
+    - `model`: a NumPyro model with sites of driving noise, and no other latent sites but those of
+      other blocks.
     - `num_moves`: moves for each draw.
-    - `num_blocks`: the time steps are cut into that many blocks, of which every move turns the next. It helps where
-      whole paths are hardly accepted.
-    - `blocks`: for the noise of a `DiffusionTree`. "branch": a move turns the noise of the branches of one level, as
-      many branches from the root, and every move takes the next level; each branch is accepted on what changes below
-      it, and has its own angle. "clade": all noise below them turns too. Without it the tree is accepted as a whole.
-    - `angle`: φ in (0, π/2], π/2 being an independent proposal. Adapted in the warm-up, for each datum on its own, to
-      `target_accept_prob`, unless `adapt_angle=False`.
+    - `num_blocks`: the time steps are cut into that many blocks, of which every move turns the
+      next. It helps where whole paths are hardly accepted.
+    - `blocks`: for the noise of a `DiffusionTree`. "branch": a move turns the noise of the branches
+      of one level, as many branches from the root, and every move takes the next level; each branch
+      is accepted on what changes below it, and has its own angle. "clade": all noise below them
+      turns too. Without it the tree is accepted as a whole.
+    - `angle`: φ in (0, π/2], π/2 being an independent proposal. Adapted in the warm-up, for each
+      datum on its own, to `target_accept_prob`, unless `adapt_angle=False`.
     - `mesh`: as for `FunctionSpaceHMC`; not inside `Gibbs`.
     """
 
@@ -233,7 +269,9 @@ class PCN(AbstractPCN):
 
 
 class PCNL(AbstractPCN):
-    """Preconditioned Crank-Nicolson Langevin moves of the noise: `PCN` with gradients, which pay where φ is small."""
+    """Preconditioned Crank-Nicolson Langevin moves of the noise: `PCN` with gradients, which pay
+    where φ is small.
+    """
 
     def __init__(self, model, *, target_accept_prob: float = 0.7, **settings):
         super().__init__(model, target_accept_prob=target_accept_prob, **settings)
@@ -258,7 +296,9 @@ def _kicked(p, force, turns):
 
 
 class AbstractBlocks(ABC):
-    """Which noise a move turns, and what is decided; energies and angles are shaped as the decisions."""
+    """Which noise a move turns, and what is decided; energies and angles are shaped as the
+    decisions.
+    """
 
     @abstractmethod
     def turns(self, number, angle, noise) -> Array:
@@ -286,7 +326,9 @@ class AbstractBlocks(ABC):
 
 
 class _TimeBlocks(AbstractBlocks):
-    """Blocks of time steps, an axis of the noise `(..., num_steps, k, dim)`. Each datum is decided on its own."""
+    """Blocks of time steps, an axis of the noise `(..., num_steps, k, dim)`. Each datum is decided
+    on its own.
+    """
 
     def __init__(self, num_blocks: int):
         self._num_blocks = num_blocks
@@ -315,7 +357,9 @@ class _TimeBlocks(AbstractBlocks):
 
 
 class _TreeBlocks(AbstractBlocks):
-    """Branches of a tree, with an energy each, one after the other in the time steps. A move takes one level."""
+    """Branches of a tree, with an energy each, one after the other in the time steps. A move takes
+    one level.
+    """
 
     def __init__(self, blocks: NoiseBlocks, whole_clades: bool):
         above = blocks.above
@@ -325,7 +369,8 @@ class _TreeBlocks(AbstractBlocks):
         for i, parent in enumerate(above):
             lineages.append([*(lineages[parent] if parent >= 0 else []), i])
         depth = max(map(len, lineages))
-        # for each level and branch: the branch of that level at or above it; none is the number of branches
+        # for each level and branch: the branch of that level at or above it; none is the number of
+        # branches
         self._owners = np.full((depth, len(above)), len(above))
         for i, lineage in enumerate(lineages):
             self._owners[: len(lineage), i] = lineage

@@ -27,17 +27,23 @@ Sites = dict[str, Array]
 
 
 def init_to_guided_mean(site=None, num_samples: int = 15):
-    """Initial values: noise at zero, which gives the noise-free guided path; parameters at their prior medians."""
+    """Initial values: noise at zero, which gives the noise-free guided path; parameters at their
+    prior medians.
+    """
     if site is not None and is_noise(site):
         return jnp.zeros(site["fn"].shape())
     return init_to_median(site, num_samples)
 
 
 def sites_of(model, model_args, model_kwargs, key=0, strategy=init_to_sample) -> dict:
-    """Sample and deterministic sites of a model at its data, with values by an initialisation strategy."""
+    """Sample and deterministic sites of a model at its data, with values by an initialisation
+    strategy.
+    """
     model = numpyro.handlers.substitute(numpyro.handlers.seed(model, key), substitute_fn=strategy)
     trace = numpyro.handlers.trace(model).get_trace(*model_args, **model_kwargs)
-    return {name: site for name, site in trace.items() if site["type"] in ("sample", "deterministic")}
+    return {
+        name: site for name, site in trace.items() if site["type"] in ("sample", "deterministic")
+    }
 
 
 def is_latent(site) -> bool:
@@ -49,31 +55,39 @@ def is_noise(site) -> bool:
 
 
 def noise_sites(trace) -> tuple[str, ...]:
-    """Names of the driving noise in a trace: the block of `PCN` in `Gibbs([(PCN(model), noise_sites), ...])`."""
-    require_instance(trace, Mapping, "trace", "sites by name, of `numpyro.handlers.trace(model).get_trace(...)`")
+    """Names of the driving noise in a trace: the block of `PCN` in `Gibbs([(PCN(model),
+    noise_sites), ...])`.
+    """
+    require_instance(
+        trace, Mapping, "trace", "sites by name, of `numpyro.handlers.trace(model).get_trace(...)`"
+    )
     return tuple(name for name, site in trace.items() if is_noise(site) and not site["is_observed"])
 
 
 def _refuse_to_draw(site):
-    """For `substitute`: the site of a sample, or of a plate's subset, that nothing has given a value."""
+    """For `substitute`: the site of a sample, or of a plate's subset, that nothing has given a
+    value.
+    """
     if site["value"] is not None or site["type"] not in ("sample", "plate"):
         return
     name = site["name"]
     if site["type"] == "plate":
         size, subsample_size = site["args"]
         raise ValueError(
-            f"plate `{name}` draws {subsample_size} of its {size} data at random, and a chain would see "
-            "one draw of them for ever: leave out `subsample_size`. Minibatches are for `SVI`; kernels "
-            "that correct for them, such as `HMCECS`, cannot hold this one."
+            f"plate `{name}` draws {subsample_size} of its {size} data at random, and a chain "
+            "would see one draw of them for ever: leave out `subsample_size`. Minibatches are for "
+            "`SVI`; kernels that correct for them, such as `HMCECS`, cannot hold this one."
         )
     raise ValueError(
-        f"site `{name}` would be drawn at random wherever the model is evaluated: it is not among the "
-        "sites whose values the kernel has. A model must have the same latent sites at every call."
+        f"site `{name}` would be drawn at random wherever the model is evaluated: it is not among "
+        "the sites whose values the kernel has. A model must have the same latent sites at every "
+        "call."
     )
 
 
 class _AsGiven(numpyro.handlers.substitute):
-    """A context in which a model that draws at random, beyond the values of its sites, raises `ValueError`.
+    """A context in which a model that draws at random, beyond the values of its sites, raises
+    `ValueError`.
 
     There is no random key, not even one of a `seed` handler inside or outside. What has no value is
     refused by its name, within control flow too. `numpyro.prng_key()` gives `None`, which does no
@@ -95,10 +109,10 @@ class _AsGiven(numpyro.handlers.substitute):
         super().__exit__(kind, error, traceback)
         if self._asked and isinstance(error, Exception):
             raise ValueError(
-                "the model needs a random key: for `numpyro.prng_key()`, the initial values of a network, "
-                "or a site under `handlers.block`. A chain would use one draw for ever. Draw by "
-                "`numpyro.sample`, or pass what was drawn as an argument, a network's parameters by "
-                f"`handlers.substitute`. Without a key came {kind.__name__}: {error}"
+                "the model needs a random key: for `numpyro.prng_key()`, the initial values of a "
+                "network, or a site under `handlers.block`. A chain would use one draw for ever. "
+                "Draw by `numpyro.sample`, or pass what was drawn as an argument, a network's "
+                f"parameters by `handlers.substitute`. Without a key came {kind.__name__}: {error}"
             ) from error
 
 
@@ -110,7 +124,8 @@ class _Nothing(dist.ImproperUniform):
 
 
 class _Split(Messenger):
-    """Takes the prior of the noise, and the likelihoods that it drives, out of a model; keeps the latter.
+    """Takes the prior of the noise, and the likelihoods that it drives, out of a model; keeps the
+    latter.
 
     What `handlers.scale` makes of the noise's prior, beyond the prior itself, stays in.
     """
@@ -128,7 +143,8 @@ class _Split(Messenger):
             log_prob = fn._log_prob_by_block(msg["value"]) if cut else fn.log_prob(msg["value"])
             scale = 1.0 if msg["scale"] is None else msg["scale"]
             log_prob = jnp.asarray(scale)[..., None] * log_prob if cut else scale * log_prob
-            if msg.get("_control_flow_done"):  # in a scan a noise may reach later data: one energy for all
+            # in a scan a noise may reach later data: one energy for all
+            if msg.get("_control_flow_done"):
                 log_prob = jnp.sum(log_prob)
             self.log_likelihood[msg["name"]] = log_prob
         if is_noise(msg) and msg["scale"] is not None:
@@ -138,20 +154,23 @@ class _Split(Messenger):
 
 
 class _Data(Messenger):
-    """Takes the data and the prior of the noise out of a model; keeps the log likelihood of all data."""
+    """Takes the data and the prior of the noise out of a model; keeps the log likelihood of all
+    data.
+    """
 
     def __init__(self, fn, latent):
         super().__init__(fn)
         self.log_likelihood = jnp.zeros(())
-        self._jacobians = {f"_{name}_log_det" for name in latent}  # factors that NumPyro adds to the priors
+        # factors that NumPyro adds to the priors
+        self._jacobians = {f"_{name}_log_det" for name in latent}
 
     def process_message(self, msg):
         if msg["type"] != "sample" or msg["name"] in self._jacobians:
             return
         require(
             msg["scale"] is None,
-            f"site `{msg['name']}` is scaled, by `handlers.scale` or a plate that is subsampled: the evidence is that "
-            "of all data, each counted once.",
+            f"site `{msg['name']}` is scaled, by `handlers.scale` or a plate that is subsampled: "
+            "the evidence is that of all data, each counted once.",
         )
         if msg["is_observed"]:
             self.log_likelihood += jnp.sum(msg["fn"].log_prob(msg["value"]))
@@ -216,7 +235,9 @@ def not_finite(model, model_args, model_kwargs, z: Sites, with_gradient: bool) -
         for name, x in sites.items():
             bad = np.asarray(x)[~np.isfinite(x)]
             if bad.size:
-                words.append(f"the {what} of `{name}`, {bad[0]} in {bad.size} of {np.size(x)} entries")
+                words.append(
+                    f"the {what} of `{name}`, {bad[0]} in {bad.size} of {np.size(x)} entries"
+                )
     return words
 
 
@@ -229,7 +250,9 @@ def misfit(model, model_args, model_kwargs, z: Sites) -> Array:
 def energies_of(
     model, model_args, model_kwargs, z: Sites, owners, by_block: bool = False
 ) -> tuple[Array, tuple[Array, ...]]:
-    """`rest`, and energies -log p(v_s | θ, z_s), an array for each noise; 0 and Φ where `owners` is `None`."""
+    """`rest`, and energies -log p(v_s | θ, z_s), an array for each noise; 0 and Φ where `owners` is
+    `None`.
+    """
     if owners is None:
         phi = misfit(model, model_args, model_kwargs, z)
         return jnp.zeros_like(phi), (phi,)
@@ -238,17 +261,27 @@ def energies_of(
 
 
 def driven_by(model, model_args, model_kwargs, z: Sites, noise=None) -> dict[str, str] | None:
-    """The site that each noise drives, if it drives one of the same batch and nothing else; `None` otherwise.
+    """The site that each noise drives, if it drives one of the same batch and nothing else; `None`
+    otherwise.
 
-    Where this holds, the data are independent given θ, each with its own noise. `noise`: names, of all of z by default.
+    Where this holds, the data are independent given θ, each with its own noise. `noise`: names, of
+    all of z by default.
     """
     noise = set(z if noise is None else noise)
-    closed, shapes = jax.make_jaxpr(lambda z: split(model, model_args, model_kwargs, z), return_shape=True)(z)
+    closed, shapes = jax.make_jaxpr(
+        lambda z: split(model, model_args, model_kwargs, z), return_shape=True
+    )(z)
     names = sorted(z)  # the order of the inputs
-    rest, *terms = [{names[i] for i in _inputs_of(closed.jaxpr, out)} & noise for out in closed.jaxpr.outvars]
+    rest, *terms = [
+        {names[i] for i in _inputs_of(closed.jaxpr, out)} & noise for out in closed.jaxpr.outvars
+    ]
     driven = {}
     for (site, shape), sources in zip(sorted(shapes[1].items()), terms, strict=True):
-        if len(sources) != 1 or not sources.isdisjoint(driven) or shape.shape != z[min(sources)].shape[: shape.ndim]:
+        if (
+            len(sources) != 1
+            or not sources.isdisjoint(driven)
+            or shape.shape != z[min(sources)].shape[: shape.ndim]
+        ):
             return None
         driven[min(sources)] = site
     return driven if set(driven) == noise and not rest else None

@@ -2,13 +2,14 @@
 
 Andrieu and Roberts (2009); Deligiannidis, Doucet and Pitt (2018).
 
-The likelihood of each datum is estimated by the mean of the weights of N bridges, which is unbiased,
+The likelihood of each datum is estimated by the mean of the weights of N bridges, which is
+unbiased,
 
     p̂(v | θ, u) = Π_s 1/N Σ_i p(v_s | θ, u_{s,i}),    u_{s,i} ~ N(0, I),
 
-and the chain of (θ, u) has the posterior of θ as margin, whatever N. The estimate is kept with its noise u, and never
-renewed at the same point. Proposals of u are correlated with it, u' = ρ u + √(1 - ρ²) ξ, so that the errors of the two
-estimates cancel.
+and the chain of (θ, u) has the posterior of θ as margin, whatever N. The estimate is kept with its
+noise u, and never renewed at the same point. Proposals of u are correlated with it, u' = ρ u + √(1
+- ρ²) ξ, so that the errors of the two estimates cancel.
 """
 
 import math
@@ -32,16 +33,20 @@ from ._reference import Windows, start_windows, update_windows
 from ._rotation import choose, kick, metropolis, normal_like, rotate, total
 
 _PILOT = 256  # bridges by which the number of particles is chosen
-_BEST_SD = 1.7  # of the log estimate, at most: above it chains stick; far below 1, particles are wasted
+# of the log estimate, at most: above it chains stick; far below 1, particles are wasted
+_BEST_SD = 1.7
 
 
 class PseudoMarginalState(NamedTuple):
     """State of the pseudo-marginal kernels.
 
-    - `z`: unconstrained parameters, and for each datum the noise of one bridge, drawn with the weights.
-    - `particles`: u, noise with an axis of N in front. `potential_energy`: minus log prior and log estimate.
+    - `z`: unconstrained parameters, and for each datum the noise of one bridge, drawn with the
+      weights.
+    - `particles`: u, noise with an axis of N in front. `potential_energy`: minus log prior and log
+      estimate.
     - `force`: minus its gradient in the parameters, for MALA. `step_size`: in whitened parameters.
-    - `diverging`: the estimate of the proposal was NaN. `seal`: by which a chain knows that it starts again.
+    - `diverging`: the estimate of the proposal was NaN. `seal`: by which a chain knows that it
+      starts again.
     """
 
     i: Array
@@ -75,12 +80,16 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         self._step_size = step_size
         if step_size is not None:
             self._step_size = known_number(step_size, "step_size", *POSITIVE)
-        self._num_particles = None if num_particles is None else positive_integer(num_particles, "num_particles")
+        self._num_particles = (
+            None if num_particles is None else positive_integer(num_particles, "num_particles")
+        )
         self._max_particles = positive_integer(max_particles, "max_particles")
 
     @abstractmethod
     def _evaluate(self, potential, theta: Array) -> tuple:
-        """The potential, `(value, energies)`, and minus its gradient, or none of it for a random walk."""
+        """The potential, `(value, energies)`, and minus its gradient, or none of it for a random
+        walk.
+        """
 
     @abstractmethod
     def _best_step(self, d: int) -> float:
@@ -131,9 +140,14 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
     def _init_one(self, key, z, reference, model_args, model_kwargs):
         key, key_particles, key_pick = jr.split(key, 3)
         theta, noise, unravel = self._parts(z)
-        require(theta.size > 0, f"{type(self).__name__} moves parameters, and the model has none but its noise.")
+        require(
+            theta.size > 0,
+            f"{type(self).__name__} moves parameters, and the model has none but its noise.",
+        )
         self._owners = driven_by(self._model, model_args, model_kwargs, z, self._noise)
-        particles = normal_like(key_particles, noise, (positive_integer(self._num_particles, "num_particles"),))
+        particles = normal_like(
+            key_particles, noise, (positive_integer(self._num_particles, "num_particles"),)
+        )
         potential = self._potential(particles, unravel, model_args, model_kwargs)
         (value, energies), force = self._evaluate(potential, theta)
         z = unravel(theta) | self._pick(key_pick, particles, energies)
@@ -141,7 +155,9 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         zero, no = jnp.zeros_like(value), jnp.array(False)
         windows, i = start_windows(reference), jnp.array(0)
         step = jnp.asarray(step, value.dtype)
-        return PseudoMarginalState(i, z, particles, value, force, step, windows, zero, zero, no, key, UNSEALED)
+        return PseudoMarginalState(
+            i, z, particles, value, force, step, windows, zero, zero, no, key, UNSEALED
+        )
 
     @property
     def _energies(self):
@@ -154,13 +170,17 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         return state._replace(potential_energy=value, force=force)
 
     def _potential(self, particles, unravel, model_args, model_kwargs):
-        """-log of the prior and of the estimate, as a function of θ, and the energies of the particles."""
+        """-log of the prior and of the estimate, as a function of θ, and the energies of the
+        particles.
+        """
 
         def potential(theta):
             sites = unravel(theta)
 
             def one(noise):
-                return energies_of(self._model, model_args, model_kwargs, sites | noise, self._owners)
+                return energies_of(
+                    self._model, model_args, model_kwargs, sites | noise, self._owners
+                )
 
             rest, energies = jax.vmap(one)(particles)
             estimates = [logsumexp(-energy, axis=0) - math.log(len(energy)) for energy in energies]
@@ -169,7 +189,9 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         return potential
 
     def _pick(self, key, particles, energies):
-        """For each datum, the noise of one particle, with probabilities proportional to the weights."""
+        """For each datum, the noise of one particle, with probabilities proportional to the
+        weights.
+        """
         groups = groups_of(particles, self._owners)
         picked = {}
         keys = jr.split(key, len(groups))
@@ -187,15 +209,24 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         reference = state.windows.reference
         step_size = state.step_size * ~still
         half = 0.5 * step_size
-        p, before = kick(jr.normal(key_p, theta.shape, theta.dtype), reference.whiten_gradient(state.force), half)
+        p, before = kick(
+            jr.normal(key_p, theta.shape, theta.dtype), reference.whiten_gradient(state.force), half
+        )
         theta_new = theta + step_size * reference.scale @ p
-        particles, _ = rotate(state.particles, normal_like(key_u, state.particles), self._turn * ~still)
+        particles, _ = rotate(
+            state.particles, normal_like(key_u, state.particles), self._turn * ~still
+        )
         potential = self._potential(particles, unravel, model_args, model_kwargs)
         (value, energies), force = self._evaluate(potential, theta_new)
         _, after = kick(p, reference.whiten_gradient(force), half)
         error = value - state.potential_energy + total(before) + total(after)
         rate, accept = metropolis(key_accept, error)
-        moved = unravel(theta_new) | self._pick(key_pick, particles, energies), particles, value, force
+        moved = (
+            unravel(theta_new) | self._pick(key_pick, particles, energies),
+            particles,
+            value,
+            force,
+        )
         kept = state.z, state.particles, state.potential_energy, state.force
         z, particles, value, force = choose(accept | still, moved, kept)
         windows, _ = update_windows(state.windows, state.i, self._num_warmup, self._parts(z)[0])
@@ -215,23 +246,28 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
 
 
 class CorrelatedPseudoMarginal(AbstractPseudoMarginal):
-    """Random walk of the parameters on averaged weights: no gradients, and no noise in the posterior.
+    """Random walk of the parameters on averaged weights: no gradients, and no noise in the
+    posterior.
 
         MCMC(CorrelatedPseudoMarginal(model), num_warmup=500, num_samples=5000)
 
     **Arguments:**
 
-    - `model`: a NumPyro model with sites of driving noise; its other latent sites are continuous parameters.
-    - `num_particles`: N, the bridges of each datum. By default it is chosen before the run, the smallest by which the
-      log estimate has a standard deviation of at most 1.7 at the mode, where chains are most efficient, with a warning
-      if `max_particles` do not suffice, or the weights of 256 bridges have too heavy a tail to tell. Where one particle
-      has a standard deviation below 1, the guide is good.
+    - `model`: a NumPyro model with sites of driving noise; its other latent sites are continuous
+      parameters.
+    - `num_particles`: N, the bridges of each datum. By default it is chosen before the run, the
+      smallest by which the log estimate has a standard deviation of at most 1.7 at the mode, where
+      chains are most efficient, with a warning if `max_particles` do not suffice, or the weights of
+      256 bridges have too heavy a tail to tell. Where one particle has a standard deviation below
+      1, the guide is good.
     - `correlation`: ρ, of the noise of successive proposals.
-    - `step_size`: of the walk, in units of the parameters' reference, a Laplace approximation that is renewed in the
-      warm-up. By default 2.56 / √d for d parameters (Sherlock, Thiery, Roberts and Rosenthal, 2015).
+    - `step_size`: of the walk, in units of the parameters' reference, a Laplace approximation that
+      is renewed in the warm-up. By default 2.56 / √d for d parameters (Sherlock, Thiery, Roberts
+      and Rosenthal, 2015).
     - `init_strategy`, `mesh`: as for `FunctionSpaceHMC`.
 
-    The noise of the posterior is that of one particle for each datum: paths can be had from it as from any kernel.
+    The noise of the posterior is that of one particle for each datum: paths can be had from it as
+    from any kernel.
     """
 
     def _evaluate(self, potential, theta):
@@ -242,7 +278,8 @@ class CorrelatedPseudoMarginal(AbstractPseudoMarginal):
 
 
 class CorrelatedPseudoMarginalMALA(AbstractPseudoMarginal):
-    """`CorrelatedPseudoMarginal` whose parameters are proposed by the Metropolis-adjusted Langevin algorithm.
+    """`CorrelatedPseudoMarginal` whose parameters are proposed by the Metropolis-adjusted Langevin
+    algorithm.
 
     Its default step is 1.65 / d^(1/6) (Roberts and Rosenthal, 1998).
     """
@@ -256,7 +293,9 @@ class CorrelatedPseudoMarginalMALA(AbstractPseudoMarginal):
 
 
 def _choose(log_weights, largest: int) -> int:
-    """The smallest number of particles by which the log estimate varies little enough, from pilot weights."""
+    """The smallest number of particles by which the log estimate varies little enough, from pilot
+    weights.
+    """
     rng = np.random.default_rng(0)
     pilot = [np.asarray(w, float) for w in log_weights]
     _warn_of_tails(np.concatenate(pilot, axis=1).T)
@@ -266,8 +305,9 @@ def _choose(log_weights, largest: int) -> int:
         if sd <= _BEST_SD:
             return n
     warnings.warn(
-        f"the log estimate of {counts[-1]} particles has a standard deviation of {sd:.1f}: above {_BEST_SD} the chain "
-        "sticks. Choose a better guide, allow more by `max_particles`, or use FunctionSpaceHMC.",
+        f"the log estimate of {counts[-1]} particles has a standard deviation of {sd:.1f}: above "
+        f"{_BEST_SD} the chain sticks. Choose a better guide, allow more by `max_particles`, or "
+        "use FunctionSpaceHMC.",
         stacklevel=2,
     )
     return counts[-1]
@@ -276,8 +316,9 @@ def _choose(log_weights, largest: int) -> int:
 def _warn_of_tails(log_weights) -> None:
     """A warning where weights `(data, bridges)` cannot tell how much a log estimate varies.
 
-    The log forgives more than a mean does, and one k̂ in many is large by chance: their average has to be below 1,
-    beyond which there is no mean to be estimated, and none may be above the threshold by two standard errors.
+    The log forgives more than a mean does, and one k̂ in many is large by chance: their average has
+    to be below 1, beyond which there is no mean to be estimated, and none may be above the
+    threshold by two standard errors.
     """
     with jax.ensure_compile_time_eval():
         shapes = np.clip(np.asarray(weights.pareto_k(log_weights)), 0.0, 2.0)
@@ -285,9 +326,10 @@ def _warn_of_tails(log_weights) -> None:
     if np.mean(shapes) < 1 and np.max(surely) < weights.pareto_k_threshold(log_weights.shape[1]):
         return
     warnings.warn(
-        f"the number of particles is chosen by weights with too heavy a tail: k̂ is {np.mean(shapes):.2f} on average "
-        f"over the data and at most {np.max(shapes):.2f}. The log estimate varies more than they say, and the chain "
-        "may stick. Choose a better guide, or give `num_particles`.",
+        "the number of particles is chosen by weights with too heavy a tail: k̂ is "
+        f"{np.mean(shapes):.2f} on average over the data and at most {np.max(shapes):.2f}. The "
+        "log estimate varies more than they say, and the chain may stick. Choose a better guide, "
+        "or give `num_particles`.",
         stacklevel=4,
     )
 

@@ -1,7 +1,8 @@
 """A Gaussian reference N(μ, L Lᵀ) of the posterior of the unconstrained parameters, θ = μ + L y.
 
-It starts as a Laplace approximation with the noise at zero, and is renewed from the draws at the end of each of two
-windows of the warm-up. y has the role of the noise: N(0, I) but for what the kernels correct.
+It starts as a Laplace approximation with the noise at zero, and is renewed from the draws at the
+end of each of two windows of the warm-up. y has the role of the noise: N(0, I) but for what the
+kernels correct.
 """
 
 from typing import NamedTuple
@@ -39,7 +40,9 @@ class Reference(NamedTuple):
 
 
 def laplace(potential, theta: Array) -> Reference:
-    """The mode of exp(-potential) and its inverse Hessian, both by BFGS from θ; N(θ, I) where that fails."""
+    """The mode of exp(-potential) and its inverse Hessian, both by BFGS from θ; N(θ, I) where that
+    fails.
+    """
     start = Reference(theta, jnp.eye(theta.size, dtype=theta.dtype))
     if not theta.size:
         return start
@@ -50,11 +53,13 @@ def laplace(potential, theta: Array) -> Reference:
 _MAX_EVALUATIONS = 100
 _GRADIENT_TOLERANCE = 1e-5
 _ROUNDING = 100.0
-"""Rounding of a potential, a sum of many terms, relative to its value, in units of the precision."""
+"""Rounding of a potential, a sum of many terms, relative to it, in units of the precision."""
 
 
 class _Search(NamedTuple):
-    """The best point x so far, its value, slope and the inverse Hessian there; x + step is tried next."""
+    """The best point x so far, its value, slope and the inverse Hessian there; x + step is tried
+    next.
+    """
 
     x: Array
     value: Array
@@ -65,10 +70,11 @@ class _Search(NamedTuple):
 
 
 def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
-    """A minimum and the inverse Hessian by BFGS with backtracking (Nocedal and Wright, 2006, algorithm 6.1).
+    """A minimum and the inverse Hessian by BFGS with backtracking (Nocedal and Wright, 2006,
+    algorithm 6.1).
 
-    One loop evaluates the function at one place. `jax.scipy.optimize.minimize` holds six copies of it, and compiling
-    them is most of what the start of a chain takes.
+    One loop evaluates the function at one place. `jax.scipy.optimize.minimize` holds six copies of
+    it, and compiling them is most of what the start of a chain takes.
     """
 
     rounding = _ROUNDING * jnp.finfo(x.dtype).eps
@@ -110,7 +116,7 @@ def _inverse_update(inverse: Array, step: Array, change: Array) -> Array:
 
 
 class Windows(NamedTuple):
-    """The reference in use, and mean, sum of squares and number of the draws of the current window."""
+    """The reference in use; mean, sum of squares and number of the draws of this window."""
 
     reference: Reference
     moments: tuple[Array, Array, Array]
@@ -124,8 +130,10 @@ def start_windows(reference: Reference) -> Windows:
     return Windows(reference, (mean, m2, n))
 
 
-def update_windows(windows: Windows, i: Array, num_warmup: int, theta: Array) -> tuple[Windows, Array]:
-    """Adds draw i of the warm-up; at the end of a window renews the reference. Says whether it did."""
+def update_windows(
+    windows: Windows, i: Array, num_warmup: int, theta: Array
+) -> tuple[Windows, Array]:
+    """Adds draw i of the warm-up, renews the reference at the end of a window, says if it did."""
     starts, ends = _schedule(num_warmup)
     if num_warmup < 20 or not theta.size:
         return windows, jnp.array(False)
@@ -137,18 +145,26 @@ def update_windows(windows: Windows, i: Array, num_warmup: int, theta: Array) ->
 
 
 def _schedule(num_warmup: int):
-    """Starts and ends of two windows. The start is near the mode: all but a tenth before and after can be used."""
+    """Starts and ends of two windows. The start is near the mode: all but a tenth before and after
+    can be used.
+    """
     cuts = [int(fraction * num_warmup) for fraction in (0.1, 0.3, 0.9)]
     return cuts[:2], cuts[1:]
 
 
 def from_moments(mean, m2, n) -> Reference:
-    """Correlations are shrunk as if 5 more draws had none: the factor exists for any number of draws."""
+    """Correlations are shrunk as if 5 more draws had none: the factor exists for any number of
+    draws.
+    """
     covariance = m2 / (n - 1)
     covariance = (n * covariance + 5 * jnp.diag(jnp.diag(covariance))) / (n + 5)
     return Reference(mean, jnp.linalg.cholesky(covariance))
 
 
 def if_finite(new: Reference, old: Reference) -> Reference:
-    good = jnp.all(jnp.isfinite(new.scale)) & jnp.all(jnp.diag(new.scale) > 0) & jnp.all(jnp.isfinite(new.mean))
+    good = (
+        jnp.all(jnp.isfinite(new.scale))
+        & jnp.all(jnp.diag(new.scale) > 0)
+        & jnp.all(jnp.isfinite(new.mean))
+    )
     return choose(good, new, old)

@@ -1,4 +1,6 @@
-"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks by a force, trajectories, and the decision to accept."""
+"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks by a force, trajectories, and the
+decision to accept.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,23 +9,33 @@ import jax.random as jr
 
 def rotate(x, p, angle):
     """x and p after a time: one for all, or a pytree of times."""
-    angle = angle if jax.tree.structure(angle) == jax.tree.structure(x) else jax.tree.map(lambda _: angle, x)
+    angle = (
+        angle
+        if jax.tree.structure(angle) == jax.tree.structure(x)
+        else jax.tree.map(lambda _: angle, x)
+    )
     new = jax.tree.map(lambda x, p, a: jnp.cos(a) * x + jnp.sin(a) * p, x, p, angle)
     return new, jax.tree.map(lambda x, p, a: jnp.cos(a) * p - jnp.sin(a) * x, x, p, angle)
 
 
 def kick(p, force, time):
     """p after the force has acted for a time, and the change of ½ p² of each coordinate."""
-    time = time if jax.tree.structure(time) == jax.tree.structure(p) else jax.tree.map(lambda _: time, p)
+    time = (
+        time
+        if jax.tree.structure(time) == jax.tree.structure(p)
+        else jax.tree.map(lambda _: time, p)
+    )
     change = jax.tree.map(lambda p, f, t: (p + 0.5 * t * f) * t * f, p, force, time)
     return jax.tree.map(lambda p, f, t: p + t * f, p, force, time), change
 
 
 def trajectory(value_and_grad, x, p, value, gradient, angle, num_steps):
-    """Steps of kick, turn by `angle`, kick, in the field of a potential Ψ: x, p, Ψ and ∇Ψ at the end, and the work.
+    """Steps of kick, turn by `angle`, kick, in the field of a potential Ψ: x, p, Ψ and ∇Ψ at the
+    end, and the work.
 
-    `value_and_grad(x)` gives ∇Ψ and, as `value`, whatever is wanted of the end. The change of ½ |x|² + ½ |p|² is the
-    work of the kicks, so that the energy's error is the change of Ψ and the work.
+    `value_and_grad(x)` gives ∇Ψ and, as `value`, whatever is wanted of the end. The change of ½
+    |x|² + ½ |p|² is the work of the kicks, so that the energy's error is the change of Ψ and the
+    work.
     """
     half = 0.5 * angle
 

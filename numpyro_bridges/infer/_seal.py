@@ -16,7 +16,7 @@ from jax.core import Tracer
 
 
 def of_arguments(arguments):
-    """Of any pytree: its arrays by their bits, the rest by its words. Known where the arrays are."""
+    """Of any pytree: its arrays by their bits, the rest by its words, where these are known."""
     leaves, structure = jax.tree.flatten(arguments)
     arrays = [leaf for leaf in leaves if _has_bits(leaf)]
     others = [leaf for leaf in leaves if not _has_bits(leaf)]

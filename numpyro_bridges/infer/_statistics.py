@@ -11,7 +11,14 @@ from ._hmc import FunctionSpaceHMC
 from ._pcn import AbstractPCN
 from ._pseudo_marginal import AbstractPseudoMarginal
 
-_HMC_FIELDS = ("potential_energy", "energy", "accept_prob", "num_steps", "adapt_state.step_size", "diverging")
+_HMC_FIELDS = (
+    "potential_energy",
+    "energy",
+    "accept_prob",
+    "num_steps",
+    "adapt_state.step_size",
+    "diverging",
+)
 
 _FIELDS = {
     HMC: _HMC_FIELDS,
@@ -29,11 +36,14 @@ _ARVIZ_NAMES = {
 
 
 def fields(kernel) -> tuple[str, ...]:
-    """What a kernel can report of each draw: `mcmc.run(key, data, extra_fields=nb.infer.fields(kernel))`.
+    """What a kernel can report of each draw: `mcmc.run(key, data,
+    extra_fields=nb.infer.fields(kernel))`.
 
-    **Arguments:** `kernel`: NUTS, HMC, a kernel of this package, or `Gibbs`, which reports what its blocks do.
+    **Arguments:** `kernel`: NUTS, HMC, a kernel of this package, or `Gibbs`, which reports what its
+    blocks do.
 
-    **Returns:** names of fields of the kernel's state; of any other kernel, those that NumPyro collects by default.
+    **Returns:** names of fields of the kernel's state; of any other kernel, those that NumPyro
+    collects by default.
     """
     require_instance(kernel, MCMCKernel, "kernel", "a kernel of MCMC, such as `NUTS(model)`")
     return tuple(path + name for block, path, _ in _blocks(kernel) for name in _fields_of(block))
@@ -43,7 +53,11 @@ def statistics(fields: dict[str, Any], kernel) -> dict[str, Any]:
     """Arrays under ArviZ's names; those of a block of `Gibbs` with its prefix."""
     found = {name: value for name, value in fields.items() if hasattr(value, "shape")}
     for block, path, prefix in _blocks(kernel):
-        own = {name.removeprefix(path): found.pop(name) for name in list(found) if name.startswith(path)}
+        own = {
+            name.removeprefix(path): found.pop(name)
+            for name in list(found)
+            if name.startswith(path)
+        }
         own = {_ARVIZ_NAMES.get(name, name): value for name, value in own.items()}
         if "lp" in own:
             own["lp"] = -own["lp"]
@@ -58,11 +72,17 @@ def statistics(fields: dict[str, Any], kernel) -> dict[str, Any]:
 
 def _fields_of(kernel) -> tuple[str, ...]:
     known = [names for kind, names in _FIELDS.items() if isinstance(kernel, kind)]
-    return known[0] if known else tuple(name for name in kernel.default_fields if name != kernel.sample_field)
+    return (
+        known[0]
+        if known
+        else tuple(name for name in kernel.default_fields if name != kernel.sample_field)
+    )
 
 
 def _blocks(kernel, path="", prefix="") -> list[tuple[Any, str, str]]:
-    """The kernels that make a draw, each with the path of its state and the prefix of its statistics."""
+    """The kernels that make a draw, each with the path of its state and the prefix of its
+    statistics.
+    """
     if not isinstance(kernel, Gibbs):
         return [(kernel, path, prefix)]
     kernels = [block for block, _ in kernel.blocks]

@@ -1,4 +1,4 @@
-"""Kernels: positive definite functions on R^dim with the closed forms that stochastic flows need."""
+"""Kernels: positive definite functions on R^dim with the closed forms that flows need."""
 
 from ._base import (
     AbstractKernel as AbstractKernel,

@@ -1,7 +1,7 @@
 """What a kernel is: values, and two closed forms.
 
-A kernel k(x, y) plays one of two roles. It is a covariance function; or it smears white noise over space,
-dX(t, s) = ∫ k(X(t, s), y) dW(t, y), and then the covariance is its convolution with itself,
+A kernel k(x, y) plays one of two roles. It is a covariance function; or it smears white noise over
+space, dX(t, s) = ∫ k(X(t, s), y) dW(t, y), and then the covariance is its convolution with itself,
 
     a(x, x') = ∫ k(x, y) k(x', y) dy.
 """
@@ -18,7 +18,7 @@ from ._parameters import point, positive_scalar, scalar, squared_distances
 
 
 class AbstractKernel(eqx.Module):
-    """A symmetric positive definite function on R^dim. `k1 + k2` and `c * k` (c > 0) are kernels."""
+    """A symmetric positive definite function on R^dim. `k1 + k2`, `c * k` (c > 0) are kernels."""
 
     __array_ufunc__ = None  # a NumPy number on the left leaves the product to `__rmul__`
 
@@ -33,13 +33,16 @@ class AbstractKernel(eqx.Module):
 
     @abstractmethod
     def convolved_with(self, other: "AbstractKernel", dim: int) -> "AbstractKernel":
-        """The kernel ∫ k(x, y) other(x', y) dy over R^dim; `ValueError` where no closed form is known."""
+        """The kernel ∫ k(x, y) other(x', y) dy over R^dim; `ValueError` where no closed form is
+        known.
+        """
 
     @abstractmethod
     def spectral_density(self, omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
         """q̂(ω) with k(x, y) = (2π)^{-dim} ∫ q̂(ω) cos(ω · (x - y)) dω.
 
-        This takes the kernel as a covariance; where it smears white noise, the covariance has the density q̂².
+        This takes the kernel as a covariance; where it smears white noise, the covariance has the
+        density q̂².
         """
 
     def convolved(self, dim: int) -> "AbstractKernel":
@@ -77,7 +80,9 @@ class AbstractRadialKernel(AbstractKernel):
     def scales(self, dtype: jnp.dtype | None = None) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Amplitude and length scale in one precision; `ValueError` if either has an axis."""
         dtype = self.amplitude.dtype if dtype is None else dtype
-        return scalar(self.amplitude, "amplitude", dtype), scalar(self.length_scale, "length_scale", dtype)
+        return scalar(self.amplitude, "amplitude", dtype), scalar(
+            self.length_scale, "length_scale", dtype
+        )
 
     def matrix(self, x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:
         distances = squared_distances(x, y)

@@ -2,7 +2,8 @@
 
 In the scaling r = |x - y| / length_scale, without the factor √(2ν) of much of the literature,
 
-    M_p(r) = Σ_i c_i r^i e^{-r},   c_{p-i} = p! (p + i)! 2^{p-i} / ((2p)! i! (p - i)!),   ν = p + 1/2.
+    M_p(r) = Σ_i c_i r^i e^{-r},   c_{p-i} = p! (p + i)! 2^{p-i} / ((2p)! i! (p - i)!),   ν = p +
+    1/2.
 """
 
 from functools import partial
@@ -27,7 +28,8 @@ def _coefficients(p: int) -> list[float]:
     """c_p, ..., c_0: the highest power first."""
     top = factorial(2 * p)
     return [
-        factorial(p) * factorial(p + i) * 2 ** (p - i) / (top * factorial(i) * factorial(p - i)) for i in range(p + 1)
+        factorial(p) * factorial(p + i) * 2 ** (p - i) / (top * factorial(i) * factorial(p - i))
+        for i in range(p + 1)
     ]
 
 
@@ -35,9 +37,9 @@ def _coefficients(p: int) -> list[float]:
 def _matern(p: int, s: Float[Array, "..."]) -> Float[Array, "..."]:
     """M_p at the squared distance s = r².
 
-    The derivative is a Matérn function again, dM_p/ds = -M_{p-1} / (2 (2p - 1)), so derivatives up to order p
-    are exact at s = 0, where those of √s are infinite. M_0 = e^{-r} has none there, and 0 stands for it: the
-    mean of the two sides.
+    The derivative is a Matérn function again, dM_p/ds = -M_{p-1} / (2 (2p - 1)), so derivatives up
+    to order p are exact at s = 0, where those of √s are infinite. M_0 = e^{-r} has none there, and
+    0 stands for it: the mean of the two sides.
     """
     r = jnp.sqrt(s)
     polynomial = jnp.zeros_like(r)
@@ -61,8 +63,8 @@ def _order(value: Any) -> int:
     order = positive_integer(value, "order", least=0)
     require(
         order <= _MAX_ORDER,
-        f"`order` must be at most {_MAX_ORDER}; got {order}. Smoothness is ν = order + 1/2; a limit of large "
-        "orders is `GaussianKernel`.",
+        f"`order` must be at most {_MAX_ORDER}; got {order}. Smoothness is ν = order + 1/2; a "
+        "limit of large orders is `GaussianKernel`.",
     )
     return order
 
@@ -70,11 +72,13 @@ def _order(value: Any) -> int:
 class MaternKernel(AbstractRadialKernel):
     """k(x, y) = amplitude · M_order(r), r = |x - y| / length_scale, of smoothness ν = order + 1/2.
 
-    Orders 0, 1 and 4 are e^{-r}, (1 + r) e^{-r} and (1 + r + 45/105 r² + 10/105 r³ + 1/105 r⁴) e^{-r}.
-    The convolution with itself has smoothness 2ν + dim/2: in odd dimensions another kernel of this class, in
-    even ones a Bessel function of integer order, which has no closed form here (`ValueError`).
+    Orders 0, 1 and 4 are e^{-r}, (1 + r) e^{-r} and (1 + r + 45/105 r² + 10/105 r³ + 1/105 r⁴)
+    e^{-r}. The convolution with itself has smoothness 2ν + dim/2: in odd dimensions another kernel
+    of this class, in even ones a Bessel function of integer order, which has no closed form here
+    (`ValueError`).
 
-    **Arguments:** `amplitude` and `length_scale` are positive scalars; `order` is an integer from 0 on.
+    **Arguments:** `amplitude` and `length_scale` are positive scalars; `order` is an integer from 0
+    on.
     """
 
     amplitude: Float[Array, ""] = eqx.field(converter=positive_scalar("amplitude"))
@@ -83,19 +87,26 @@ class MaternKernel(AbstractRadialKernel):
 
     if TYPE_CHECKING:  # mypy knows nothing of converters
 
-        def __init__(self, amplitude: ArrayLike, length_scale: ArrayLike, order: int = 4) -> None: ...
+        def __init__(
+            self, amplitude: ArrayLike, length_scale: ArrayLike, order: int = 4
+        ) -> None: ...
 
     def profile(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         return _matern(self.order, s)
 
     def convolved_with(self, other: AbstractKernel, dim: int) -> "MaternKernel":
-        """With itself, in odd dimensions: order 2 · order + (dim + 1)/2 and the same length scale."""
+        """With itself, in odd dimensions: order 2 · order + (dim + 1)/2, the same length scale."""
         dim = positive_integer(dim, "dim")
         if other is not self or dim % 2 == 0:
-            what = f"in dimension {dim}" if other is self else f"with an `other`, {type(other).__name__}"
+            what = (
+                f"in dimension {dim}"
+                if other is self
+                else f"with an `other`, {type(other).__name__}"
+            )
             raise ValueError(
-                f"a `MaternKernel` has a closed convolution with itself in odd dimensions only; got one "
-                f"{what}. Give the covariance itself (`covariance=`), or a `QuadratureCovariance`."
+                "a `MaternKernel` has a closed convolution with itself in odd dimensions only; "
+                f"got one {what}. Give the covariance itself (`covariance=`), or a "
+                "`QuadratureCovariance`."
             )
         amplitude, length_scale = self.scales()
         order = 2 * self.order + (dim + 1) // 2

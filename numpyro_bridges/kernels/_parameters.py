@@ -1,4 +1,6 @@
-"""Parameters and points of kernels: what is checked when they come in, and again when they are used."""
+"""Parameters and points of kernels: what is checked when they come in, and again when they are
+used.
+"""
 
 from collections.abc import Callable
 from functools import reduce
@@ -12,8 +14,9 @@ from .._checks import as_float, floating, positive_integer, require, require_pos
 def scalar(value: Array, name: str, dtype: jnp.dtype) -> Float[Array, ""]:
     """A parameter at the moment of its use, in the precision of the points.
 
-    `jax.vmap` of a constructor returns a module whose parameters have a leading axis. Used without `vmap`, it
-    would broadcast against the rows of a matrix and give a wrong number, so any axis is refused.
+    `jax.vmap` of a constructor returns a module whose parameters have a leading axis. Used without
+    `vmap`, it would broadcast against the rows of a matrix and give a wrong number, so any axis is
+    refused.
     """
     require(
         jnp.ndim(value) == 0,
@@ -24,12 +27,14 @@ def scalar(value: Array, name: str, dtype: jnp.dtype) -> Float[Array, ""]:
 
 
 def positive_scalar(name: str) -> Callable[[ArrayLike], Float[Array, ""]]:
-    """A field converter: a positive, finite scalar of the default float type. Traced values pass."""
+    """A field converter: a positive, finite scalar of the default float type, or traced."""
 
     def convert(value: ArrayLike) -> Float[Array, ""]:
         value = as_float(value, name)
         value = scalar(value, name, value.dtype)
-        require_positive(value, name, "A prior on the positive half-line (`dist.LogNormal`) keeps it there.")
+        require_positive(
+            value, name, "A prior on the positive half-line (`dist.LogNormal`) keeps it there."
+        )
         return value
 
     return convert
@@ -40,7 +45,8 @@ def point(x: ArrayLike, name: str) -> Float[Array, " dim"]:
     x = floating(x, name)
     require(
         x.ndim == 1,
-        f"`{name}` must be of shape (dim,); got shape {x.shape}. Many points are for `matrix`, a batch for `jax.vmap`.",
+        f"`{name}` must be of shape (dim,); got shape {x.shape}. Many points are for `matrix`, a "
+        "batch for `jax.vmap`.",
     )
     return x
 
@@ -50,20 +56,25 @@ def points(x: ArrayLike, name: str) -> Float[Array, "n dim"]:
     x = floating(x, name)
     require(
         x.ndim == 2,
-        f"`{name}` must hold one point a row, (n, dim); got shape {x.shape}. For a batch, use `jax.vmap`.",
+        f"`{name}` must hold one point a row, (n, dim); got shape {x.shape}. For a batch, use "
+        "`jax.vmap`.",
     )
     return x
 
 
 def squared_distances(x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:
-    """|x_i - y_j|² from differences: exactly 0 at coincident points, symmetric where x is y, smooth."""
+    """|x_i - y_j|² from differences: exactly 0 at coincident points, symmetric where x is y,
+    smooth.
+    """
     x, y = points(x, "x"), points(y, "y")
     require(
         x.shape[1] == y.shape[1],
         f"`x` and `y` must hold points of one dimension; got shapes {x.shape} and {y.shape}.",
     )
     # one coordinate at a time: whole n × m arrays, and a derivative with none of shape (n, m, dim)
-    return reduce(jnp.add, (jnp.square(a[:, None] - b[None, :]) for a, b in zip(x.T, y.T, strict=True)))
+    return reduce(
+        jnp.add, (jnp.square(a[:, None] - b[None, :]) for a, b in zip(x.T, y.T, strict=True))
+    )
 
 
 def squared_frequency(omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
@@ -72,6 +83,7 @@ def squared_frequency(omega: Float[Array, "... dim"], dim: int) -> Float[Array, 
     omega = floating(omega, "omega")
     require(
         omega.ndim > 0 and omega.shape[-1] == dim,
-        f"`omega` must hold frequency vectors of R^{dim}, (..., {dim}); got shape {jnp.shape(omega)}.",
+        f"`omega` must hold frequency vectors of R^{dim}, (..., {dim}); got shape "
+        f"{jnp.shape(omega)}.",
     )
     return jnp.sum(jnp.square(omega), axis=-1)

@@ -25,9 +25,9 @@ from ._base import AbstractKernel
 class QuadratureCovariance(AbstractKernel):
     """a(x, x') = ∫ k(x, y) k(x', y) dy, the midpoint rule on a box of equal cells.
 
-    For a smooth kernel the error is negligible once cells are half a length scale wide and the box reaches
-    several length scales beyond the points; what lies outside the box is lost, so a(x, x) falls towards its
-    border. A matrix costs (n + m) · cells kernel values.
+    For a smooth kernel the error is negligible once cells are half a length scale wide and the box
+    reaches several length scales beyond the points; what lies outside the box is lost, so a(x, x)
+    falls towards its border. A matrix costs (n + m) · cells kernel values.
 
     **Arguments:**
 
@@ -41,8 +41,19 @@ class QuadratureCovariance(AbstractKernel):
     upper: Float[Array, " dim"]
     num_cells: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, kernel: AbstractKernel, lower: ArrayLike, upper: ArrayLike, num_cells: int | Sequence[int]):
-        require_instance(kernel, AbstractKernel, "kernel", "a kernel, such as `MaternKernel(amplitude, length_scale)`")
+    def __init__(
+        self,
+        kernel: AbstractKernel,
+        lower: ArrayLike,
+        upper: ArrayLike,
+        num_cells: int | Sequence[int],
+    ):
+        require_instance(
+            kernel,
+            AbstractKernel,
+            "kernel",
+            "a kernel, such as `MaternKernel(amplitude, length_scale)`",
+        )
         self.kernel = kernel
         self.lower, self.upper = as_float(lower, "lower"), as_float(upper, "upper")
         shape = self.lower.shape
@@ -61,7 +72,8 @@ class QuadratureCovariance(AbstractKernel):
         per_axis = list(cells) if several else [cells] * shape[0]
         require(
             len(per_axis) == shape[0],
-            f"`num_cells` must be a positive integer, or one for each of {shape[0]} axes; got {words(num_cells)}.",
+            f"`num_cells` must be a positive integer, or one for each of {shape[0]} axes; got "
+            f"{words(num_cells)}.",
         )
         self.num_cells = tuple(positive_integer(number, "num_cells") for number in per_axis)
 
@@ -75,7 +87,8 @@ class QuadratureCovariance(AbstractKernel):
         """Midpoints of the cells."""
         require(
             self.lower.ndim == 1,
-            f"`lower` must be of shape (dim,); got {self.lower.shape}. For a batch, use `jax.vmap`.",
+            f"`lower` must be of shape (dim,); got {self.lower.shape}. For a batch, use "
+            "`jax.vmap`.",
         )
         dtype = self.lower.dtype
         axes = [(jnp.arange(c, dtype=dtype) + 0.5) / c for c in self.num_cells]
@@ -98,10 +111,13 @@ class QuadratureCovariance(AbstractKernel):
         return self(middle, middle)
 
     def convolved_with(self, other: AbstractKernel, dim: int) -> AbstractKernel:
-        raise ValueError("a `QuadratureCovariance` is a covariance: it is passed as `covariance=`, not as a kernel.")
+        raise ValueError(
+            "a `QuadratureCovariance` is a covariance: it is passed as `covariance=`, not as a "
+            "kernel."
+        )
 
     def spectral_density(self, omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
         raise ValueError(
-            "a `QuadratureCovariance` is not stationary and has no spectral density; without the box it is "
-            "the square of the kernel's, `kernel.spectral_density(omega, dim) ** 2`."
+            "a `QuadratureCovariance` is not stationary and has no spectral density; without the "
+            "box it is the square of the kernel's, `kernel.spectral_density(omega, dim) ** 2`."
         )

@@ -14,7 +14,9 @@ def pyplot() -> Any:
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:
-        raise ImportError("Drawing needs matplotlib: pip install 'numpyro_bridges[examples]'") from error
+        raise ImportError(
+            "Drawing needs matplotlib: pip install 'numpyro_bridges[examples]'"
+        ) from error
     return plt
 
 
@@ -26,7 +28,8 @@ def check_axes(ax: Any) -> None:
 
 
 def shape_axes(ax: Any, points: NDArray, size: float = 5.0) -> Any:
-    """The given axes, or new ones without frame in the proportions of (..., 2) points, `size` inches long.
+    """The given axes, or new ones without frame in the proportions of (..., 2) points, `size`
+    inches long.
 
     One unit is as long in x as in y.
     """
@@ -78,7 +81,9 @@ def time_map() -> Any:
 def as_times(ts: ArrayLike | None, num_times: int) -> NDArray:
     times = np.linspace(0.0, 1.0, num_times) if ts is None else known_float(ts, "ts")
     if times.shape != (num_times,):
-        raise ValueError(f"`ts` must have the shape ({num_times},), one time for each state, got {times.shape}.")
+        raise ValueError(
+            f"`ts` must have the shape ({num_times},), one time for each state, got {times.shape}."
+        )
     require(np.all(np.isfinite(times)), f"`ts` must be finite; got {times}.")
     return times
 
@@ -92,7 +97,9 @@ def as_points(points: ArrayLike, name: str, *shapes: str) -> NDArray:
             "Of shapes in space draw two coordinates: points[..., :2]."
         )
     if not len(seen(points)):
-        raise ValueError(f"`{name}` must have a point that is not missing, got none of {points.shape}.")
+        raise ValueError(
+            f"`{name}` must have a point that is not missing, got none of {points.shape}."
+        )
     return points
 
 

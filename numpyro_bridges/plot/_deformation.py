@@ -25,7 +25,8 @@ def deformation(
     cmap: Any = "PuOr",
     **kwargs: Any,
 ) -> Any:
-    """A grid as the flow carries it along a path, coloured by how much area grows, log₂ of the Jacobian determinant.
+    """A grid as the flow carries it along a path, coloured by how much area grows, log₂ of the
+    Jacobian determinant.
 
     **Arguments:**
 
@@ -37,16 +38,23 @@ def deformation(
     - `closed`: whether the last point of an outline is joined to the first.
     - `cmap`: a colour map whose middle stands for no change.
 
-    Broken is the outline at the start, drawn out the one at the end. Further keywords go to `pcolormesh`.
+    Broken is the outline at the start, drawn out the one at the end. Further keywords go to
+    `pcolormesh`.
 
-    **Returns:** its `QuadMesh`; `fig.colorbar(mesh, label="log₂ area")` explains its colours. A determinant that is not
-    positive, where steps are too long for the flow, is left white.
+    **Returns:** its `QuadMesh`; `fig.colorbar(mesh, label="log₂ area")` explains its colours. A
+    determinant that is not positive, where steps are too long for the flow, is left white.
     """
     require_instance(flow, KunitaFlow, "flow", "a flow, such as `KunitaFlow(space, kernel)`")
-    require(flow.space.dim == 2, f"`flow` must move points of the plane; those of its space are in R^{flow.space.dim}.")
+    require(
+        flow.space.dim == 2,
+        f"`flow` must move points of the plane; those of its space are in R^{flow.space.dim}.",
+    )
     path = as_points(path, "path", "(K + 1, n, 2)")
     n = flow.space.size
-    require(path.shape[1] == n, f"`path` must have {n} rows, as many as a state of `flow`; got shape {path.shape}.")
+    require(
+        path.shape[1] == n,
+        f"`path` must have {n} rows, as many as a state of `flow`; got shape {path.shape}.",
+    )
     num_lines = positive_integer(num_lines, "num_lines", least=2)
     margin = known_number(margin, "margin", "a number from 0 on", lambda value: value >= 0)
     closed = flag(closed, "closed")

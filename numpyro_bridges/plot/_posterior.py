@@ -20,8 +20,8 @@ def posterior(
 ) -> list:
     """Marginal densities of scalar parameters: posterior filled, prior as a broken line.
 
-    Densities are Gaussian kernel estimates, reflected at zero where every draw is positive. A bar marks the
-    central interval, a dot the median; the prior is shown over its central 80 %.
+    Densities are Gaussian kernel estimates, reflected at zero where every draw is positive. A bar
+    marks the central interval, a dot the median; the prior is shown over its central 80 %.
 
     **Arguments:**
 
@@ -43,16 +43,25 @@ def posterior(
             values = known_float(value, f"samples[{name!r}]")
             draws |= {name: values} if values.ndim == 1 and values.size else {}
     if not draws:
-        raise ValueError("`samples` must hold at least one scalar parameter, an entry of shape (S,).")
+        raise ValueError(
+            "`samples` must hold at least one scalar parameter, an entry of shape (S,)."
+        )
     for name, values in draws.items():
         if not np.isfinite(values).all():
-            raise ValueError(f"`samples[{name!r}]` must be finite, got NaN or infinite draws: find out why first.")
+            raise ValueError(
+                f"`samples[{name!r}]` must be finite, got NaN or infinite draws: find out why "
+                "first."
+            )
     if axes is None:
-        figure, axes = pyplot().subplots(1, len(draws), figsize=(2.8 * len(draws), 2.0), layout="constrained")
+        figure, axes = pyplot().subplots(
+            1, len(draws), figsize=(2.8 * len(draws), 2.0), layout="constrained"
+        )
         figure.get_layout_engine().set(w_pad=0.12)
     axes = np.ravel(axes)
     if len(axes) != len(draws):
-        raise ValueError(f"`axes` must be as many as the parameters {list(draws)}, got {len(axes)}.")
+        raise ValueError(
+            f"`axes` must be as many as the parameters {list(draws)}, got {len(axes)}."
+        )
     areas = []
     for ax, (name, values) in zip(axes, draws.items(), strict=True):
         grids = [_grid(values, 0.001)]
@@ -65,7 +74,9 @@ def posterior(
             )
             grids.append(_grid(before, 0.1))
             curves.append(_density(before, grids[1]))
-            ax.plot(grids[1], curves[1], color="#555555", linewidth=1.2, linestyle=(0, (4, 2)), zorder=3)
+            ax.plot(
+                grids[1], curves[1], color="#555555", linewidth=1.2, linestyle=(0, (4, 2)), zorder=3
+            )
         areas.append(ax.fill_between(grids[0], curves[0], color=ACCENT, alpha=0.35, linewidth=0.0))
         ax.plot(grids[0], curves[0], color=ACCENT, linewidth=1.4)
         tail = (1.0 - level) / 2.0
@@ -79,9 +90,20 @@ def posterior(
             clip_on=False,
             zorder=4,
         )
-        ax.plot(middle, 0.0, "o", color="white", markeredgecolor=START, markersize=6, clip_on=False, zorder=5)
+        ax.plot(
+            middle,
+            0.0,
+            "o",
+            color="white",
+            markeredgecolor=START,
+            markersize=6,
+            clip_on=False,
+            zorder=5,
+        )
         if truth is not None and name in truth:
-            ax.axvline(known_number(truth[name], f"truth[{name!r}]"), color=TARGET, linewidth=1.4, zorder=2)
+            ax.axvline(
+                known_number(truth[name], f"truth[{name!r}]"), color=TARGET, linewidth=1.4, zorder=2
+            )
         ax.set(xlabel=name, yticks=[], ylim=(0.0, 1.08 * max(curve.max() for curve in curves)))
         ax.set_xlim(min(grid[0] for grid in grids), max(grid[-1] for grid in grids))
         ax.spines[["left", "top", "right"]].set_visible(False)
@@ -89,7 +111,9 @@ def posterior(
 
 
 def _grid(values: NDArray, tail: float) -> NDArray:
-    """Where a density is drawn: between two quantiles and a little beyond, above zero if every draw is."""
+    """Where a density is drawn: between two quantiles and a little beyond, above zero if every draw
+    is.
+    """
     low, high = np.quantile(values, [tail, 1.0 - tail])
     margin = 3.0 * _bandwidth(values)
     low = low - margin
@@ -98,12 +122,16 @@ def _grid(values: NDArray, tail: float) -> NDArray:
 
 def _bandwidth(values: NDArray) -> float:
     """Silverman's rule, with the smaller of the two usual spreads; positive for equal draws too."""
-    spread = min(values.std(), np.subtract(*np.quantile(values, [0.75, 0.25])) / 1.34) or values.std()
+    spread = (
+        min(values.std(), np.subtract(*np.quantile(values, [0.75, 0.25])) / 1.34) or values.std()
+    )
     return float(0.9 * max(spread, 1e-6 * abs(values).max(), 1e-12) * len(values) ** -0.2)
 
 
 def _density(values: NDArray, grid: NDArray) -> NDArray:
-    """Kernel estimate whose bandwidth is narrow where draws are dense (Abramson 1982): keeps sharp modes."""
+    """Kernel estimate whose bandwidth is narrow where draws are dense (Abramson 1982): keeps sharp
+    modes.
+    """
     values = values[:: max(1, len(values) // 4000)]
 
     def estimate(at: NDArray, bandwidth: NDArray) -> NDArray:

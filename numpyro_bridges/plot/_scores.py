@@ -26,34 +26,40 @@ def score_frames(
     scale: float | None = None,
     closed: bool = True,
 ) -> list[list[Any]]:
-    """The drift a(t, x) ∇ log h̃(t, x) that conditioning adds, on the shapes of a path: a row of frames for each bridge.
+    """The drift a(t, x) ∇ log h̃(t, x) that conditioning adds, on the shapes of a path: a row of
+    frames for each bridge.
 
-    Below each shape, in pale grey, lies the target: the state nearest to the path's end that meets the condition.
+    Below each shape, in pale grey, lies the target: the state nearest to the path's end that meets
+    the condition.
 
     **Arguments:**
 
     - `bridges`: of shapes in the plane; or several by name, as for numbers of basis functions.
-    - `paths`: (K + 1, n, 2), the states of a path at the bridge's `ts`, or coefficients on a `FourierBasis`; for
-      several bridges the paths by the same names, or one for all.
+    - `paths`: (K + 1, n, 2), the states of a path at the bridge's `ts`, or coefficients on a
+      `FourierBasis`; for several bridges the paths by the same names, or one for all.
     - `times`: from t0 to before t1, one column each; drawn at the nearest grid time before t1.
     - `file`: where to write; matplotlib knows the format by its ending.
-    - `scale`: length of an arrow for one unit of drift, a time. The same in all frames; by default the longest arrow
-      is a third of the largest shape's extent.
+    - `scale`: length of an arrow for one unit of drift, a time. The same in all frames; by default
+      the longest arrow is a third of the largest shape's extent.
     - `closed`: whether the last point is joined to the first.
 
-    **Returns:** the `Quiver`s, a list for each row. The figure is closed. **Errors:** `ValueError` for shapes, names
-    and times that do not fit; `ImportError` without matplotlib.
+    **Returns:** the `Quiver`s, a list for each row. The figure is closed. **Errors:** `ValueError`
+    for shapes, names and times that do not fit; `ImportError` without matplotlib.
     """
     bridges = bridges if isinstance(bridges, Mapping) else {"": bridges}
     require(len(bridges) > 0, "`bridges` must hold at least one `GuidedBridge`; got none.")
     for name, bridge in bridges.items():
-        require_instance(bridge, GuidedBridge, f"bridges[{name!r}]" if name else "bridges", "a `GuidedBridge`")
+        require_instance(
+            bridge, GuidedBridge, f"bridges[{name!r}]" if name else "bridges", "a `GuidedBridge`"
+        )
     file, closed = as_file(file, "file"), flag(closed, "closed")
     if scale is not None:
         scale = known_number(scale, "scale", "a number from 0 on, a time", lambda value: value >= 0)
     paths = paths if isinstance(paths, Mapping) else dict.fromkeys(bridges, paths)
     if set(paths) != set(bridges):
-        raise ValueError(f"`paths` must have the names of `bridges`, {list(bridges)}; got {list(paths)}.")
+        raise ValueError(
+            f"`paths` must have the names of `bridges`, {list(bridges)}; got {list(paths)}."
+        )
     rows = {name: _Row(bridge, paths[name], times) for name, bridge in bridges.items()}
     length = _default_scale(list(rows.values())) if scale is None else scale
     corners = np.concatenate([row.corners(length) for row in rows.values()])
@@ -62,11 +68,16 @@ def score_frames(
     drawn = []
     for line, (name, row) in zip(axes, rows.items(), strict=True):
         drawn.append([row.draw(ax, i, length, closed) for i, ax in enumerate(line)])
-        line[0].text(-0.04, 0.5, name, transform=line[0].transAxes, rotation=90, ha="right", va="center")
+        line[0].text(
+            -0.04, 0.5, name, transform=line[0].transAxes, rotation=90, ha="right", va="center"
+        )
         if row.times is first or not np.allclose(row.times, first):
             for ax, time in zip(line, row.times, strict=True):
                 ax.set_title(f"$t = {time:.3g}$", fontsize=10)
-    words = f"arrows: $a\\,s$, the drift that conditioning adds, × {length:.2g} time units; grey: the target"
+    words = (
+        f"arrows: $a\\,s$, the drift that conditioning adds, × {length:.2g} time units; "
+        "grey: the target"
+    )
     figure.supxlabel(words, fontsize=9)
     figure.savefig(file, dpi=150)
     pyplot().close(figure)
@@ -84,19 +95,28 @@ class _Row:
         drifts = _guiding_drift(bridge, states)[chosen]
         self.drifts = np.asarray(jax.vmap(to_points)(drifts), dtype=float)
         if not np.isfinite(self.drifts).all():
-            raise ValueError("`paths` must lead to finite drifts a(t, x) ∇ log h̃(t, x); got NaN or infinite ones.")
+            raise ValueError(
+                "`paths` must lead to finite drifts a(t, x) ∇ log h̃(t, x); got NaN or infinite "
+                "ones."
+            )
         self.points = as_points(jax.vmap(to_points)(states[chosen]), "paths", "(T, q, 2)")
-        self.target = np.asarray(to_points(bridge.condition.reference(bridge.sde, states[-1])), dtype=float)
+        self.target = np.asarray(
+            to_points(bridge.condition.reference(bridge.sde, states[-1])), dtype=float
+        )
 
     def corners(self, scale: float) -> NDArray:
         """All that is drawn, (N, 2)."""
-        return np.concatenate([seen(part) for part in (self.points, self.points + scale * self.drifts, self.target)])
+        return np.concatenate(
+            [seen(part) for part in (self.points, self.points + scale * self.drifts, self.target)]
+        )
 
     def draw(self, ax: Any, i: int, scale: float, closed: bool) -> Any:
         limits = ax.axis()
         draw(ax, self.target[None], closed, colors=_PALE, linewidths=2.0, zorder=0)
         longest = float(np.linalg.norm(self.drifts[i], axis=1).max())
-        arrows = score_field(self.points[i], self.drifts[i], ax, length=scale * longest, closed=closed, width=0.007)
+        arrows = score_field(
+            self.points[i], self.drifts[i], ax, length=scale * longest, closed=closed, width=0.007
+        )
         ax.axis(limits)
         return arrows
 
@@ -104,14 +124,21 @@ class _Row:
 def _default_scale(rows: list[_Row]) -> float:
     """The longest arrow is a third of the largest extent; 0 where there is no drift."""
     longest = max(np.linalg.norm(row.drifts, axis=-1).max() for row in rows)
-    return float(max(np.ptp(row.points, axis=1).max() for row in rows) / (3 * longest)) if longest > 0 else 0.0
+    return (
+        float(max(np.ptp(row.points, axis=1).max() for row in rows) / (3 * longest))
+        if longest > 0
+        else 0.0
+    )
 
 
 def _states(bridge: GuidedBridge, path: ArrayLike) -> jax.Array:
     states = as_float(path, "paths").astype(bridge.x0.dtype)
     shape = (bridge.num_steps + 1, *bridge.x0.shape)
     if states.shape != shape:
-        raise ValueError(f"`paths` must have a state for each of a bridge's `ts`, shape {shape}; got {states.shape}.")
+        raise ValueError(
+            f"`paths` must have a state for each of a bridge's `ts`, shape {shape}; got "
+            f"{states.shape}."
+        )
     return states
 
 
@@ -138,7 +165,9 @@ def _canvas(num_rows: int, num_columns: int, corners: NDArray) -> tuple[Any, Any
     margin = 0.04 * (high - low).max()
     width, height = 2.1 * np.maximum((high - low) / (high - low).max(), 0.2)
     size = (width * num_columns + 0.4, height * num_rows + 0.7)
-    figure, axes = pyplot().subplots(num_rows, num_columns, figsize=size, squeeze=False, layout="constrained")
+    figure, axes = pyplot().subplots(
+        num_rows, num_columns, figsize=size, squeeze=False, layout="constrained"
+    )
     for ax in axes.flat:
         ax.set_axis_off()
         ax.set_aspect("equal")

@@ -21,7 +21,8 @@ def outlines(
 ) -> Any:
     """Shapes (n, 2) or (N, n, 2) as thin outlines, with their mean (n, 2) on top if it is given.
 
-    A missing (NaN) point leaves a gap. Further keywords go to the `LineCollection`, which is returned.
+    A missing (NaN) point leaves a gap. Further keywords go to the `LineCollection`, which is
+    returned.
     """
     shapes = as_points(shapes, "shapes", "(n, 2)", "(N, n, 2)")
     shapes = shapes.reshape(-1, *shapes.shape[-2:])
@@ -31,7 +32,14 @@ def outlines(
     style: dict[str, Any] = {"alpha": _opacity(len(shapes))} | kwargs
     lines = draw(ax, shapes, closed, colors=color, linewidths=linewidth, **style)
     if mean is not None:
-        draw(ax, as_points(mean, "mean", "(n, 2)")[None], closed, colors=START, linewidths=2.0, zorder=3)
+        draw(
+            ax,
+            as_points(mean, "mean", "(n, 2)")[None],
+            closed,
+            colors=START,
+            linewidths=2.0,
+            zorder=3,
+        )
     return lines
 
 
@@ -53,12 +61,14 @@ def path(
     - `path`: (K + 1, n, 2).
     - `ax`: axes to draw on.
     - `ts`: (K + 1,) times, default 0 to 1 in equal steps.
-    - `num_outlines`: how many to draw, the first and the last included, at nearly equal steps of the grid.
+    - `num_outlines`: how many to draw, the first and the last included, at nearly equal steps of
+      the grid.
     - `closed`: whether the last point is joined to the first.
     - `trajectories`: whether to draw the way of every point as a faint line.
     - `cmap`: colour map over time.
 
-    **Returns:** the `LineCollection` of outlines; `fig.colorbar(lines, label="time")` explains its colours.
+    **Returns:** the `LineCollection` of outlines; `fig.colorbar(lines, label="time")` explains its
+    colours.
     """
     path = as_points(path, "path", "(K + 1, n, 2)")
     times = as_times(ts, len(path))
@@ -66,10 +76,14 @@ def path(
     num_outlines = positive_integer(num_outlines, "num_outlines")
     ax = shape_axes(ax, path)
     if trajectories:
-        draw(ax, path.transpose(1, 0, 2), False, colors=NEUTRAL, linewidths=0.5, alpha=0.5, zorder=1)
+        draw(
+            ax, path.transpose(1, 0, 2), False, colors=NEUTRAL, linewidths=0.5, alpha=0.5, zorder=1
+        )
     chosen = np.unique(np.linspace(0, len(path) - 1, num_outlines).round().astype(int))
     widths = np.where(np.isin(chosen, (0, len(path) - 1)), 2.2, 1.0)
-    lines = draw(ax, path[chosen], closed, linewidths=widths, cmap=cmap or time_map(), zorder=2, **kwargs)
+    lines = draw(
+        ax, path[chosen], closed, linewidths=widths, cmap=cmap or time_map(), zorder=2, **kwargs
+    )
     lines.set_array(times[chosen])
     lines.set_clim(times[0], times[-1])
     return lines
@@ -87,10 +101,11 @@ def bridge_fan(
     closed: bool = True,
     max_outlines: int = 100,
 ) -> list:
-    """Bridges from a start to a target as a strip of frames: at each of a few times, all their outlines.
+    """Bridges from a start to a target as a strip of frames: at each of a few times, all their
+    outlines.
 
-    Every frame repeats the start (dark, bold in the first frame) and the target (orange, bold in the last),
-    so that the eye sees the fan leave one, widen and close on the other.
+    Every frame repeats the start (dark, bold in the first frame) and the target (orange, bold in
+    the last), so that the eye sees the fan leave one, widen and close on the other.
 
     **Arguments:**
 
@@ -126,13 +141,30 @@ def bridge_fan(
         fan = {"colors": [colors[frame]], "linewidths": 0.8, "alpha": _opacity(len(paths))}
         first, last = frame == 0, frame == num_frames - 1
         drawn.append(draw(ax, paths[:, index] + shift, closed, **fan))
-        draw(ax, (start + shift)[None], closed, colors=START, linewidths=2.2 if first else 0.9, zorder=3)
+        draw(
+            ax,
+            (start + shift)[None],
+            closed,
+            colors=START,
+            linewidths=2.2 if first else 0.9,
+            zorder=3,
+        )
         dashes = "-" if last else (0, (4, 2))
         width = 2.2 if last else 0.9
-        draw(ax, (target + shift)[None], closed, colors=TARGET, linewidths=width, linestyles=dashes, zorder=4)
+        draw(
+            ax,
+            (target + shift)[None],
+            closed,
+            colors=TARGET,
+            linewidths=width,
+            linestyles=dashes,
+            zorder=4,
+        )
         below = ((low[0] + high[0]) / 2.0 + shift[0], low[1] + shift[1])
         label = f"$t = {times[index]:.2g}$"
-        ax.annotate(label, below, (0, -5), textcoords="offset points", ha="center", va="top", fontsize=9)
+        ax.annotate(
+            label, below, (0, -5), textcoords="offset points", ha="center", va="top", fontsize=9
+        )
     return drawn
 
 
@@ -152,15 +184,17 @@ def score_field(
 
     - `points`, `arrows`: (n, 2).
     - `ax`: axes to draw on.
-    - `length`: the longest arrow in the unit of the points; default a quarter of the shape's larger extent.
-      Arrows are in proportion to one another.
+    - `length`: the longest arrow in the unit of the points; default a quarter of the shape's larger
+      extent. Arrows are in proportion to one another.
     - `closed`: whether the last point is joined to the first.
 
     **Returns:** the `Quiver`.
     """
     points, arrows = as_points(points, "points", "(n, 2)"), as_points(arrows, "arrows", "(n, 2)")
     if arrows.shape != points.shape:
-        raise ValueError(f"`arrows` must have the shape of `points` {points.shape}, got {arrows.shape}.")
+        raise ValueError(
+            f"`arrows` must have the shape of `points` {points.shape}, got {arrows.shape}."
+        )
     closed = flag(closed, "closed")
     if length is None:
         length = 0.25 * float(np.ptp(seen(points), axis=0).max())
@@ -172,7 +206,9 @@ def score_field(
     ax.plot(*points.T, linestyle="none", marker="o", markersize=2.5, color=START, zorder=2)
     ax.update_datalim(points + drawn)
     ax.autoscale_view()
-    settings = dict(angles="xy", scale_units="xy", scale=1.0, width=0.0045, headwidth=3.5, headlength=4.5)
+    settings = dict(
+        angles="xy", scale_units="xy", scale=1.0, width=0.0045, headwidth=3.5, headlength=4.5
+    )
     return ax.quiver(*points.T, *drawn.T, color=color, zorder=3, **settings | kwargs)
 
 

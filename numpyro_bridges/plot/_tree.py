@@ -6,7 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._checks import flag, known_float, known_number, positive_integer, require, require_instance, words
+from .._checks import (
+    flag,
+    known_float,
+    known_number,
+    positive_integer,
+    require,
+    require_instance,
+    words,
+)
 from ..trees import Tree
 from ._canvas import ACCENT, NEUTRAL, START, as_points, check_axes, draw, polygons, pyplot, seen
 
@@ -25,17 +33,18 @@ def tree(
 ) -> Any:
     """A tree as a ladder, time from left to right, with names and shapes at its nodes.
 
-    Tips are named, and inner nodes that are seen. All shapes are drawn on one scale, whatever the scales of the axes:
-    those of tips beside them, before their names, those of inner nodes on them, centred.
+    Tips are named, and inner nodes that are seen. All shapes are drawn on one scale, whatever the
+    scales of the axes: those of tips beside them, before their names, those of inner nodes on them,
+    centred.
 
     **Arguments:**
 
     - `tree`: a `Tree`, its lengths known.
     - `ax`: axes to draw on.
-    - `shapes`: one `(n, 2)` for each of some nodes, by name or by number, or an array `(num_nodes, n, 2)`. Nodes whose
-      shape is all NaN have none.
-    - `draws`: in the same way `(S, n, 2)`, or `(S, num_nodes, n, 2)`, such as posterior draws of ancestors: translucent
-      outlines below the shape, which is their mean unless `shapes` has one.
+    - `shapes`: one `(n, 2)` for each of some nodes, by name or by number, or an array `(num_nodes,
+      n, 2)`. Nodes whose shape is all NaN have none.
+    - `draws`: in the same way `(S, n, 2)`, or `(S, num_nodes, n, 2)`, such as posterior draws of
+      ancestors: translucent outlines below the shape, which is their mean unless `shapes` has one.
     - `closed`: whether the last point is joined to the first.
     - `size`: the larger extent of the largest shape, its draws included, in inches.
     - `max_outlines`: draws so many of the draws at most, evenly spaced.
@@ -68,7 +77,12 @@ def tree(
     for node, outline in centred.items():
         shift = 0.5 * beside + 0.06 if node in tree.tips else 0.0
         place = {"transform": _around(ax, x[node], y[node], inches, shift), "clip_on": False}
-        paper = {"colors": "white", "facecolors": "white" if closed else "none", "linewidths": 3.0, "zorder": 2}
+        paper = {
+            "colors": "white",
+            "facecolors": "white" if closed else "none",
+            "linewidths": 3.0,
+            "zorder": 2,
+        }
         ax.add_collection(polygons(outline[None], closed, **paper, **place), autolim=False)
         if node in clouds:
             opacity = float(np.clip(10.0 / len(clouds[node]), 0.15, 0.5))
@@ -82,7 +96,9 @@ def tree(
         ax.annotate(tree.names[tip] or "", (x[tip], y[tip]), (right, 0.0), va="center", **style)
     for node in named:
         below = -36.0 * inches * height - 3.0
-        ax.annotate(tree.names[node] or "", (x[node], y[node]), (0.0, below), ha="center", va="top", **style)
+        ax.annotate(
+            tree.names[node] or "", (x[node], y[node]), (0.0, below), ha="center", va="top", **style
+        )
     return branches
 
 
@@ -103,7 +119,10 @@ def _by_node(tree: Tree, given: Any, name: str, whole: str, single: str) -> dict
     if given is None:
         return {}
     if isinstance(given, Mapping):
-        require(len(given) > 0, f"`{name}` must have an entry for at least one node; got none. Leave it out then.")
+        require(
+            len(given) > 0,
+            f"`{name}` must have an entry for at least one node; got none. Leave it out then.",
+        )
         numbered = {}
         for key, value in given.items():
             numbered[_number(tree, key, name)] = as_points(value, f"{name}[{key!r}]", single)
@@ -112,8 +131,9 @@ def _by_node(tree: Tree, given: Any, name: str, whole: str, single: str) -> dict
         count = array.shape[-3]
         require(
             count == tree.num_nodes,
-            f"`{name}` must have the shape {whole} with {tree.num_nodes} nodes, got {array.shape}. Shapes of some "
-            "nodes are given by name: {name: shape}.",
+            f"`{name}` must have the shape {whole} with {tree.num_nodes} nodes, got "
+            f"{array.shape}. Shapes of some nodes are given by name: "
+            "{name: shape}.",
         )
         numbered = {node: array[..., node, :, :] for node in range(count)}
     return {node: array for node, array in numbered.items() if len(seen(array))}
@@ -125,7 +145,8 @@ def _number(tree: Tree, key: Any, name: str) -> int:
     whole = isinstance(number, (int, np.integer)) and not isinstance(number, bool)
     require(
         whole and 0 <= number < tree.num_nodes,
-        f"`{name}` must be given by names of nodes, or by numbers from 0 to {tree.num_nodes - 1}; got {words(key)}.",
+        f"`{name}` must be given by names of nodes, or by numbers from 0 to {tree.num_nodes - 1}; "
+        f"got {words(key)}.",
     )
     return int(number)
 
@@ -141,7 +162,8 @@ def _middle(outline: NDArray) -> NDArray:
 
 
 def _axes(ax: Any, x: NDArray, y: NDArray, pitch: float, before: float) -> Any:
-    """The given axes, or new ones, with `pitch` inches for each tip and some for the shape at the root.
+    """The given axes, or new ones, with `pitch` inches for each tip and some for the shape at the
+    root.
 
     Time is the only axis that is drawn.
     """
@@ -159,7 +181,9 @@ def _axes(ax: Any, x: NDArray, y: NDArray, pitch: float, before: float) -> Any:
 
 
 def _around(ax: Any, x: float, y: float, inches: float, shift: float) -> Any:
-    """From the units of a shape to the canvas: around a point of the axes, `shift` inches to its right."""
+    """From the units of a shape to the canvas: around a point of the axes, `shift` inches to its
+    right.
+    """
     from matplotlib.transforms import Affine2D, ScaledTranslation
 
     on_paper = Affine2D().scale(inches).translate(shift, 0.0) + ax.figure.dpi_scale_trans

@@ -1,12 +1,14 @@
-"""Weighted clouds of paths, and what their points say of the score of the density that they represent.
+"""Weighted clouds of paths, and what their points say of the score of the density that they
+represent.
 
-Let the density of y_j be the marginal of ∏ exp ℓ_i(y_i, y_{i+1}). Moving y_{j+1} by δ and y_j by ρ δ in the integral,
+Let the density of y_j be the marginal of ∏ exp ℓ_i(y_i, y_{i+1}). Moving y_{j+1} by δ and y_j by ρ
+δ in the integral,
 
     ∇log p(y_{j+1}) = E[g_{j+1} | y_{j+1}],    g_{j+1} = ∇_{y_{j+1}} ℓ_j + ρ_j (g_j + ∇_{y_j} ℓ_j),
 
-for any number ρ_j. With ρ = 0 this is the target of denoising score matching, whose noise grows as the step shrinks;
-for Brownian motion ρ_j = j/(j + 1) gives −(y_j − y_0)/(σ² t_j), without noise. ρ is the least squares coefficient,
-found in a cloud of its own.
+for any number ρ_j. With ρ = 0 this is the target of denoising score matching, whose noise grows as
+the step shrinks; for Brownian motion ρ_j = j/(j + 1) gives −(y_j − y_0)/(σ² t_j), without noise. ρ
+is the least squares coefficient, found in a cloud of its own.
 """
 
 from collections.abc import Callable
@@ -27,7 +29,8 @@ from ._reversed import ReversedSDE
 
 
 class Cloud(eqx.Module):
-    """Points and targets `(K, B, n, dim)`, weights `(K, B)` that add to 1 at each time, and ρ `(K,)`.
+    """Points and targets `(K, B, n, dim)`, weights `(K, B)` that add to 1 at each time, and ρ
+    `(K,)`.
 
     Along the grid of the bridge that it trains, but for its end.
     """
@@ -61,8 +64,12 @@ def adjoint_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None) 
     return _cloud(bridge, key, start, _drawn(law), log_pair, log_weight, rho)
 
 
-def reversal_cloud(bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray, size: int, rho=None) -> Cloud:
-    """h(t, ·) of a bridge, at points of its conditioned paths: time reversals, led to x0 by a guide of their own."""
+def reversal_cloud(
+    bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray, size: int, rho=None
+) -> Cloud:
+    """h(t, ·) of a bridge, at points of its conditioned paths: time reversals, led to x0 by a guide
+    of their own.
+    """
     key_start, key_path, key = jr.split(key, 3)
     starts = ends(bridge, key_start, size)
 
@@ -78,7 +85,16 @@ def reversal_cloud(bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray
     def no_weight(times, y):
         return jnp.zeros((), y.dtype)
 
-    return _cloud(bridge, key, paths[-1], lambda times, y, key, given: given, log_pair, no_weight, rho, paths[:-1])
+    return _cloud(
+        bridge,
+        key,
+        paths[-1],
+        lambda times, y, key, given: given,
+        log_pair,
+        no_weight,
+        rho,
+        paths[:-1],
+    )
 
 
 def ends(bridge: GuidedBridge, key: PRNGKeyArray, size: int) -> Array:
@@ -112,7 +128,9 @@ def forward_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None) 
     return _cloud(bridge, key, start, _drawn(law), log_pair, no_weight, rho)
 
 
-def reversed_bridge(bridge: GuidedBridge, end: State, guide: AbstractGuide | None = None) -> GuidedBridge:
+def reversed_bridge(
+    bridge: GuidedBridge, end: State, guide: AbstractGuide | None = None
+) -> GuidedBridge:
     """The reversed process from the end of a bridge, conditioned on x0, on the mirrored grid."""
     shown, elapsed = bridge.shown_ts, bridge.grid.elapsed
     reverse = ReversedSDE(bridge.sde, shown[-1])
@@ -129,7 +147,9 @@ def log_density(transition: Transition, y: State) -> Float[Array, ""]:
 def _drawn(law: Callable) -> Callable:
     def advance(times, y, key, given):
         transition = law(times, y)
-        return transition.mean + apply(transition.factor, jr.normal(key, _noise_shape(transition, y), y.dtype))
+        return transition.mean + apply(
+            transition.factor, jr.normal(key, _noise_shape(transition, y), y.dtype)
+        )
 
     return advance
 
@@ -141,8 +161,9 @@ def _noise_shape(transition: Transition, y: State):
 def _cloud(bridge, key, y, advance, log_pair, log_weight, rho, given=None) -> Cloud:
     """Particles y `(B, n, dim)` from the end of the bridge's grid to its start.
 
-    `advance(times, y, key, given)` moves one, `log_pair(times, y, new)` is ℓ, `log_weight(times, y)` what it gains;
-    `times` are the step's in the order of the grid. Resampled where less than half are effective.
+    `advance(times, y, key, given)` moves one, `log_pair(times, y, new)` is ℓ, `log_weight(times,
+    y)` what it gains; `times` are the step's in the order of the grid. Resampled where less than
+    half are effective.
     """
     size, seen = y.shape[0], bridge.end()[0]
     start_moves = not seen.exact
@@ -159,7 +180,9 @@ def _cloud(bridge, key, y, advance, log_pair, log_weight, rho, given=None) -> Cl
         logits = logits + jax.vmap(log_weight, (None, 0))(times, y)
         weights, past = jax.nn.softmax(logits), g + pull
         if rho is None:
-            rho = _coefficient(jax.vmap(lambda x, s: whiten(bridge, t0, x, s)), weights, new, push, past)
+            rho = _coefficient(
+                jax.vmap(lambda x, s: whiten(bridge, t0, x, s)), weights, new, push, past
+            )
         rho = moves * rho
         g = push + rho * past
         poor = 1 / jnp.sum(weights**2) < size / 2
@@ -181,14 +204,18 @@ def _observed_score(bridge: GuidedBridge, x: State) -> State:
     seen, _ = bridge.end()
     v = bridge.observed()
     assert seen.factor is not None  # an exact observation has no density
-    return GaussianMessage(seen.operator, jnp.zeros_like(v), seen.factor, v, seen.log_scale).score(x)
+    return GaussianMessage(seen.operator, jnp.zeros_like(v), seen.factor, v, seen.log_scale).score(
+        x
+    )
 
 
 def _coefficient(norm, weights, x, push, past) -> Float[Array, ""]:
     """The ρ from 0 to 1 that makes push + ρ past smallest."""
     push, past = norm(x, push), norm(x, past)
     w = weights.reshape(-1, *[1] * (push.ndim - 1))
-    return jnp.clip(-jnp.sum(w * push * past) / jnp.maximum(jnp.sum(w * past * past), 1e-30), 0.0, 1.0)
+    return jnp.clip(
+        -jnp.sum(w * push * past) / jnp.maximum(jnp.sum(w * past * past), 1e-30), 0.0, 1.0
+    )
 
 
 def _systematic(key, weights) -> Array:

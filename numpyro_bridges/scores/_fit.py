@@ -1,9 +1,10 @@
 """Training of learned guides: what is the same for every method, and the three methods.
 
 - `residual`: the evidence bound E log w is maximised (Yang, van der Meulen and Sommer 2025).
-- `adjoint`: score matching on the weighted reversed process from the observation (Baker, Schauer and Sommer 2025).
-- `reversal`: score matching of the unconditioned process gives the time reversal; score matching on its paths gives the
-  bridge (Heng, De Bortoli, Doucet and Thornton 2021), twice reversed.
+- `adjoint`: score matching on the weighted reversed process from the observation (Baker, Schauer
+  and Sommer 2025).
+- `reversal`: score matching of the unconditioned process gives the time reversal; score matching on
+  its paths gives the bridge (Heng, De Bortoli, Doucet and Thornton 2021), twice reversed.
 """
 
 import warnings
@@ -29,10 +30,26 @@ from .._linalg import apply, full_precision
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractCondition
-from ..guiding import AbstractGuide, FrozenGuide, ScoreGuide, ScorePlan, Standard, Unguided, default_guide
+from ..guiding import (
+    AbstractGuide,
+    FrozenGuide,
+    ScoreGuide,
+    ScorePlan,
+    Standard,
+    Unguided,
+    default_guide,
+)
 from ..sdes import AbstractSDE, BrownianMotion
 from ..spaces import Landmarks
-from ._clouds import Cloud, adjoint_cloud, ends, forward_cloud, reversal_cloud, reversed_bridge, whiten
+from ._clouds import (
+    Cloud,
+    adjoint_cloud,
+    ends,
+    forward_cloud,
+    reversal_cloud,
+    reversed_bridge,
+    whiten,
+)
 from ._networks import MLP, ROWWISE, PointNetwork, over_batch
 from ._training import Training, train
 
@@ -84,43 +101,50 @@ def fit(
         score = scores.fit(sde, condition, x0=x0, t1=1.0, key=key)
         bridge.with_guide(score)
 
-    Its weights are exact whatever was learned, and what is returned is the best network met on held-out paths, the
-    guide as it is included: training does not spoil a guide. Nor does it always help: `history["gain"]` is how far the
-    evidence bound lies above that of the guide alone on the same held-out paths, in nats, and `history["gain_error"]`
-    the standard error of that. Where the gain is within two of them a warning says so, and where the held-out paths
-    are too few to tell.
+    Its weights are exact whatever was learned, and what is returned is the best network met on
+    held-out paths, the guide as it is included: training does not spoil a guide. Nor does it always
+    help: `history["gain"]` is how far the evidence bound lies above that of the guide alone on the
+    same held-out paths, in nats, and `history["gain_error"]` the standard error of that. Where the
+    gain is within two of them a warning says so, and where the held-out paths are too few to tell.
 
     **Arguments:**
 
-    - `sde`, `condition`, `x0`, `t1`, `t0`, `num_steps` (100 by default), `ts`, `guide`: as for `GuidedBridge`.
-      `guide=Unguided()` learns all of ∇log h from nothing.
-    - `method`: `"residual"` (any SDE and condition), `"adjoint"` (an observation of the whole state) or `"reversal"`
-      (an observed value); the latter two need noise in every direction.
-    - `network`: `network(t, x, v, theta)`, see `ScoreGuide`; by default a `PointNetwork` for landmarks, an `MLP` else.
+    - `sde`, `condition`, `x0`, `t1`, `t0`, `num_steps` (100 by default), `ts`, `guide`: as for
+      `GuidedBridge`. `guide=Unguided()` learns all of ∇log h from nothing.
+    - `method`: `"residual"` (any SDE and condition), `"adjoint"` (an observation of the whole
+      state) or `"reversal"` (an observed value); the latter two need noise in every direction.
+    - `network`: `network(t, x, v, theta)`, see `ScoreGuide`; by default a `PointNetwork` for
+      landmarks, an `MLP` else.
     - `training`: a `Training`.
-    - `draw`: `draw(key)` gives `(sde, condition, x0)` like those given, for a guide that serves many of them: other
-      parameters, targets or starts. `context(sde)`, `(c,)`, are the parameters that the network is told; it is always
-      told the target.
-    - `directory`: where training is saved at each look; the same call resumes from there, and another is refused.
+    - `draw`: `draw(key)` gives `(sde, condition, x0)` like those given, for a guide that serves
+      many of them: other parameters, targets or starts. `context(sde)`, `(c,)`, are the parameters
+      that the network is told; it is always told the target.
+    - `directory`: where training is saved at each look; the same call resumes from there, and
+      another is refused.
     - `progress`: show a bar with the loss, the evidence bound and the ESS on held-out paths.
-    - `watch`: `watch(name, guide)` is called at each look, with the guide as it then is and the history so far; `name`
-      is the method's, or `"time reversal"` in the first pass of `"reversal"`.
-    - `mesh`: the devices that share a batch and the held-out paths, as for `numpyro_bridges.spread`. With `draw` the
-      problems of a batch are shared, where there are equal shares of them. Of a cloud, of `"adjoint"` and `"reversal"`
-      without `draw`, they share the network's work, and each makes the cloud.
+    - `watch`: `watch(name, guide)` is called at each look, with the guide as it then is and the
+      history so far; `name` is the method's, or `"time reversal"` in the first pass of
+      `"reversal"`.
+    - `mesh`: the devices that share a batch and the held-out paths, as for
+      `numpyro_bridges.spread`. With `draw` the problems of a batch are shared, where there are
+      equal shares of them. Of a cloud, of `"adjoint"` and `"reversal"` without `draw`, they share
+      the network's work, and each makes the cloud.
 
-    **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
-    training with a warning.
+    **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is
+    not finite ends the training with a warning.
     """
     choice(method, "method", sorted(METHODS), "'residual' suits every bridge.")
     require_key(key)
     if ts is None and num_steps is None:
         num_steps = 100
-    bridge = GuidedBridge(sde, condition, x0=x0, t1=t1, t0=t0, num_steps=num_steps, ts=ts, guide=guide)
+    bridge = GuidedBridge(
+        sde, condition, x0=x0, t1=t1, t0=t0, num_steps=num_steps, ts=ts, guide=guide
+    )
     require(
         bridge.flat is None,
-        "`condition` is known by its density, for which states of several columns are flattened: a network of "
-        "such states cannot be learned. Fit one for an `InexactMatch` near it, or use the default guide.",
+        "`condition` is known by its density, for which states of several columns are flattened: "
+        "a network of such states cannot be learned. Fit one for an `InexactMatch` near it, or "
+        "use the default guide.",
     )
     training = Training() if training is None else training
     require_instance(training, Training, "training", "a `Training(...)`")
@@ -177,7 +201,9 @@ def residual(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
         def one(key):
             key_draw, key_noise = jr.split(key)
             bridge = problem.draw(key_draw)
-            held = jax.tree.map(lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, network)
+            held = jax.tree.map(
+                lambda a: jax.lax.stop_gradient(a) if eqx.is_array(a) else a, network
+            )
             guide = replace(problem.guide, network=network, held=held)
             noise = jr.normal(key_noise, bridge.noise_shape, bridge.x0.dtype)
             return -bridge.with_guide(guide).log_weight(noise)
@@ -197,8 +223,8 @@ def adjoint(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     whole = whole and (seen.factor is None or bool(jnp.all(jnp.isfinite(seen.factor))))
     require(
         whole,
-        "`method='adjoint'` starts at an observation of the whole state; this condition leaves a part of it free. "
-        "Use `method='residual'`.",
+        "`method='adjoint'` starts at an observation of the whole state; this condition leaves a "
+        "part of it free. Use `method='residual'`.",
     )
     key_judge, key_pilot, key = jr.split(key, 3)
     loss = _regression(problem, adjoint_cloud, _coefficients(problem, adjoint_cloud, key_pilot))
@@ -211,7 +237,8 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     _need_noise(bridge, "reversal")
     require(
         bridge.condition.num_extra_noises == 0,
-        "`method='reversal'` needs an observed value, and this condition is a set. Use `method='residual'`.",
+        "`method='reversal'` needs an observed value, and this condition is a set. Use "
+        "`method='residual'`.",
     )
     key_standard, key_pilots, key_judges, key_first, key_second = jr.split(key, 5)
     (key_pilot, key_pilot_2), (key_judge, key_judge_2) = jr.split(key_pilots), jr.split(key_judges)
@@ -225,7 +252,10 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     start = _untrained(network, problem.draw, context, key_standard, lambda bridge: bridge.x0)
     start = replace(start, context=None if context is None else lambda sde: context(sde.sde))
     unguided = isinstance(bridge.guide, Unguided)
-    draws = [partial(draw_back, guide=g) for g in ([lambda _: Unguided()] if unguided else [_linearised, _driftless])]
+    draws = [
+        partial(draw_back, guide=g)
+        for g in ([lambda _: Unguided()] if unguided else [_linearised, _driftless])
+    ]
     rho = _coefficients(problem._replace(draw=draws[0]), forward_cloud, key_pilot)
 
     def candidate(draw):
@@ -263,7 +293,9 @@ def _driftless(bridge: GuidedBridge) -> AbstractGuide:
 METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
 
 
-def _train(problem: Problem, loss, judge, key, name, *, given, directory, progress, watch, mesh) -> ScoreGuide:
+def _train(
+    problem: Problem, loss, judge, key, name, *, given, directory, progress, watch, mesh
+) -> ScoreGuide:
     def guide(network, history):
         return replace(problem.guide, network=network, history=history)
 
@@ -281,33 +313,49 @@ def _train(problem: Problem, loss, judge, key, name, *, given, directory, progre
         file=file,
         problem=(given, problem.guide.standard),
         progress=progress,
-        watch=None if watch is None else lambda network, history: watch(name, guide(network, history)),
+        watch=None
+        if watch is None
+        else lambda network, history: watch(name, guide(network, history)),
         mesh=mesh,
     )
     return guide(network, history | _gain(name, judged(problem.guide.network), judged(network)))
 
 
 def _gain(name: str, before, after) -> dict[str, Array]:
-    """What training has brought on held-out paths, by what is judged before and after it; a warning if nothing."""
+    """What training has brought on held-out paths, by what is judged before and after it; a warning
+    if nothing.
+    """
     if len(before) == 3:  # a time reversal is not a guide, and has no paths of its own
         return {}
     differences = np.asarray(after[3] - before[3], float)
     gain, few = np.mean(differences), differences.size < _LEAST_HELD_OUT
     error = np.nan if few else np.std(differences, ddof=1) / np.sqrt(differences.size)
     ess, ess_before = (100 * float(found[2]) for found in (after, before))
-    bounds = f"its bound is {gain:.2g} ± {error:.1g} nats above the guide's, its ESS {ess:.3g} % ({ess_before:.3g} %)"
-    failed = not np.isfinite(before[1]) and np.isfinite(after[1])  # of a guide that fails any network is a gain
+    bounds = (
+        f"its bound is {gain:.2g} ± {error:.1g} nats above the guide's, "
+        f"its ESS {ess:.3g} % ({ess_before:.3g} %)"
+    )
+    # of a guide that fails any network is a gain
+    failed = not np.isfinite(before[1]) and np.isfinite(after[1])
     if bool(before[0] == jnp.inf):
-        said = "brought nothing: the weights of the guide are equal to rounding, and there is nothing to learn"
+        said = (
+            "brought nothing: the weights of the guide are equal to rounding, and there is "
+            "nothing to learn"
+        )
     elif not np.any(differences):
-        said = "brought nothing: no network was better than the guide alone, which is kept as it was"
+        said = (
+            "brought nothing: no network was better than the guide alone, which is kept as it was"
+        )
     elif few:
         said = (
-            f"may have brought nothing: {differences.size} independent held-out differences are too few to tell, and "
-            f"{_LEAST_HELD_OUT} are needed. Increase `Training(held_out=...)`"
+            f"may have brought nothing: {differences.size} independent held-out differences are "
+            f"too few to tell, and {_LEAST_HELD_OUT} are needed. Increase `Training(held_out=...)`"
         )
     elif not (gain > 2 * error or failed):
-        said = f"brought nothing: {bounds} on held-out paths. Use the guide alone, or train longer or otherwise"
+        said = (
+            f"brought nothing: {bounds} on held-out paths. Use the guide alone, or train longer or "
+            "otherwise"
+        )
     else:
         said = ""
     if said:
@@ -361,7 +409,9 @@ def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
             def one(t, x, f, target):
                 return jnp.sum(whiten(bridge, t, x, plan.score(f, x) - target) ** 2)
 
-            squares = jax.vmap(jax.vmap(one, (None, 0, 0, 0)))(bridge.shown_ts[:-1], cloud.x, output, target)
+            squares = jax.vmap(jax.vmap(one, (None, 0, 0, 0)))(
+                bridge.shown_ts[:-1], cloud.x, output, target
+            )
             dt = jnp.diff(ts)
             return jnp.sum(dt[:, None] * cloud.weights * squares) / jnp.sum(dt)
 
@@ -385,10 +435,12 @@ def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
 
 
 def _judge(problem: Problem, key: PRNGKeyArray):
-    """E log w, and the ESS fraction, on held-out paths; and its independent parts, of which it is the mean.
+    """E log w, and the ESS fraction, on held-out paths; and its independent parts, of which it is
+    the mean.
 
-    Weights that do not vary are a perfect guide's: value ∞. Noises come in pairs z, −z: what is of first order in the
-    network then cancels from the bound. A pair is a part, or all of one problem where there are several.
+    Weights that do not vary are a perfect guide's: value ∞. Noises come in pairs z, −z: what is of
+    first order in the network then cancels from the bound. A pair is a part, or all of one problem
+    where there are several.
     """
     draws = 16 if problem.amortised else 1
     half = -(-problem.training.held_out // (2 * draws))
@@ -438,7 +490,10 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> Scor
     pooled = isinstance(bridge.sde.space, Landmarks)
     away = jnp.mean((paths - v[:, None]) ** 2, axis=(0, 1))
     if pooled:
-        centre, width = jnp.zeros(()), jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=1, keepdims=True)) ** 2))
+        centre, width = (
+            jnp.zeros(()),
+            jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=1, keepdims=True)) ** 2)),
+        )
         away = jnp.mean(away)
     else:
         centre, width = jnp.mean(v, axis=0), jnp.std(v, axis=0)
@@ -447,7 +502,12 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> Scor
     scale = jnp.where(scale > 1e-6 * jnp.max(scale), scale, 1.0)
     deviation = jnp.std(theta, axis=0)
     standard = Standard(
-        duration, scale, centre, width, jnp.mean(theta, axis=0), jnp.where(deviation > 0, deviation, 1.0)
+        duration,
+        scale,
+        centre,
+        width,
+        jnp.mean(theta, axis=0),
+        jnp.where(deviation > 0, deviation, 1.0),
     )
     return ScoreGuide(bridge.guide, network, standard, context)
 
@@ -458,5 +518,6 @@ def _need_noise(bridge: GuidedBridge, method: str) -> None:
         pivots = jnp.diagonal(jnp.linalg.cholesky(a)) if a.ndim == 2 else jnp.atleast_1d(a)
         require(
             jnp.all(pivots > 0),
-            f"`method={method!r}` needs noise in every direction, and a(t0, x0) is singular. Use `method='residual'`.",
+            f"`method={method!r}` needs noise in every direction, and a(t0, x0) is singular. Use "
+            "`method='residual'`.",
         )

@@ -1,4 +1,6 @@
-"""Networks `network(t, x, v, theta)`: `ScoreGuide` says what they are given. Ours start at zero, `UNet` does not."""
+"""Networks `network(t, x, v, theta)`: `ScoreGuide` says what they are given. Ours start at zero,
+`UNet` does not.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,7 +19,7 @@ State2 = Float[Array, "n dim"]
 
 
 def time_features(t: Float[Array, ""], num: int) -> Float[Array, " 2*num"]:
-    """cos and sin of t at `num` frequencies from 1/2 to 8 turns, and none of the state's own scale."""
+    """cos and sin of t at `num` frequencies from 1/2 to 8 turns, whatever the state's scale."""
     angles = 2 * jnp.pi * t * jnp.asarray(np.geomspace(0.5, 8.0, num), t.dtype)
     return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)])
 
@@ -25,13 +27,22 @@ def time_features(t: Float[Array, ""], num: int) -> Float[Array, " 2*num"]:
 class MLP(eqx.Module):
     """A fully connected network on all coordinates; for states of a fixed size.
 
-    **Arguments:** `shape`: of the state, (n, dim). `context`: size of theta. `width`, `depth`: of the hidden layers.
+    **Arguments:** `shape`: of the state, (n, dim). `context`: size of theta. `width`, `depth`: of
+    the hidden layers.
     """
 
     layers: eqx.nn.MLP
     num_times: int = eqx.field(static=True)
 
-    def __init__(self, shape: tuple[int, int], context: int = 0, *, key: PRNGKeyArray, width: int = 64, depth: int = 3):
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        context: int = 0,
+        *,
+        key: PRNGKeyArray,
+        width: int = 64,
+        depth: int = 3,
+    ):
         require_key(key)
         self.num_times, size = 4, _size(shape)
         context = positive_integer(context, "context", least=0)
@@ -46,16 +57,19 @@ class MLP(eqx.Module):
 
 
 class PointNetwork(eqx.Module):
-    """A network on a set of points, for any number of them: trained at 32 points, it can be used at 128.
+    """A network on a set of points, for any number of them: trained at 32 points, it can be used at
+    128.
 
-    Point i has features h_i; a layer adds to it an MLP of h_i and of averages over the other points,
+    Point i has features h_i; a layer adds to it an MLP of h_i and of averages over the other
+    points,
 
         (1/n) Σ_j exp(−|v_i − v_j|²/2 l²) V h_j,      a few learned widths l,
 
-    so that it commutes with relabelling, does not see translations, and has a limit as points fill a curve.
+    so that it commutes with relabelling, does not see translations, and has a limit as points fill
+    a curve.
 
-    **Arguments:** `dim`: of the points. `context`: size of theta. `width`: of the features. `depth`: layers. `heads`:
-    widths l.
+    **Arguments:** `dim`: of the points. `context`: size of theta. `width`: of the features.
+    `depth`: layers. `heads`: widths l.
     """
 
     inner: eqx.nn.Linear
@@ -65,7 +79,14 @@ class PointNetwork(eqx.Module):
     outer: eqx.nn.Linear
 
     def __init__(
-        self, dim: int, context: int = 0, *, key: PRNGKeyArray, width: int = 16, depth: int = 2, heads: int = 2
+        self,
+        dim: int,
+        context: int = 0,
+        *,
+        key: PRNGKeyArray,
+        width: int = 16,
+        depth: int = 2,
+        heads: int = 2,
     ):
         require_key(key)
         dim, context = positive_integer(dim, "dim"), positive_integer(context, "context", least=0)
@@ -74,15 +95,25 @@ class PointNetwork(eqx.Module):
         key_in, key_out, *keys = jr.split(key, 2 + 2 * depth)
         self.inner = eqx.nn.Linear(2 * dim + context + 10, width, key=key_in)
         self.values = [eqx.nn.Linear(width, width, key=k) for k in keys[:depth]]
-        self.updates = [eqx.nn.MLP((1 + heads) * width, width, width, 1, jax.nn.silu, key=k) for k in keys[depth:]]
+        self.updates = [
+            eqx.nn.MLP((1 + heads) * width, width, width, 1, jax.nn.silu, key=k)
+            for k in keys[depth:]
+        ]
         self.log_widths = jnp.linspace(jnp.log(0.15), jnp.log(3.0), heads)
         self.outer = _zero(eqx.nn.Linear(width, dim, key=key_out))
 
     def __call__(self, t, x: State2, v: State2, theta: Float[Array, " c"]) -> State2:
         n = x.shape[0]
         square = jnp.sum((v[:, None] - v[None]) ** 2, -1)
-        near = jnp.exp(-0.5 * square[None] * jnp.exp(-2 * self.log_widths.astype(x.dtype))[:, None, None]) / n
-        time = jnp.concatenate([jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))]), time_features(t, 4), theta])
+        near = (
+            jnp.exp(
+                -0.5 * square[None] * jnp.exp(-2 * self.log_widths.astype(x.dtype))[:, None, None]
+            )
+            / n
+        )
+        time = jnp.concatenate(
+            [jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))]), time_features(t, 4), theta]
+        )
         shared = jnp.broadcast_to(time.astype(x.dtype), (n, time.shape[0]))
         h = jax.vmap(self.inner)(jnp.concatenate([x, v, shared], axis=1))
         for value, update in zip(self.values, self.updates, strict=True):
@@ -92,14 +123,16 @@ class PointNetwork(eqx.Module):
 
 
 class Singular(eqx.Module):
-    """Another network, preconditioned for a score that is singular near the end; for `guide=Unguided()`.
+    """Another network, preconditioned for a score that is singular near the end; for
+    `guide=Unguided()`.
 
-    With l = √(1 − t + softness) the output is (network(t, x/l, v, θ) + g(t) x/l) / l, g a learned function of the time.
-    Near an observed end ∇log h is −a⁻¹(x − v)/(1 − t) up to smaller terms, and x − v is of size √(1 − t): what is
-    learned is then of size 1 at all times.
+    With l = √(1 − t + softness) the output is (network(t, x/l, v, θ) + g(t) x/l) / l, g a learned
+    function of the time. Near an observed end ∇log h is −a⁻¹(x − v)/(1 − t) up to smaller terms,
+    and x − v is of size √(1 − t): what is learned is then of size 1 at all times.
 
-    **Arguments:** `network`: as for `ScoreGuide`. `softness`: the part of the duration, before the end, in which l
-    stops shrinking: where the grid's last steps are short, or the observation's noise is known.
+    **Arguments:** `network`: as for `ScoreGuide`. `softness`: the part of the duration, before the
+    end, in which l stops shrinking: where the grid's last steps are short, or the observation's
+    noise is known.
     """
 
     network: Any
@@ -108,8 +141,13 @@ class Singular(eqx.Module):
 
     def __init__(self, network: Any, *, key: PRNGKeyArray, softness: float = 0.0):
         require_key(key)
-        require(callable(network), f"`network` must be a function (t, x, v, theta); got {words(network)}.")
-        softness = known_number(softness, "softness", "a number from 0 on", lambda value: value >= 0)
+        require(
+            callable(network),
+            f"`network` must be a function (t, x, v, theta); got {words(network)}.",
+        )
+        softness = known_number(
+            softness, "softness", "a number from 0 on", lambda value: value >= 0
+        )
         gain = eqx.nn.MLP(10, "scalar", 16, 1, jax.nn.silu, key=key)
         self.gain = eqx.tree_at(lambda m: m.layers[-1], gain, replace_fn=_zero)
         self.network, self.softness = network, softness
@@ -117,19 +155,22 @@ class Singular(eqx.Module):
     def __call__(self, t, x: State2, v: State2, theta: Float[Array, " c"]) -> State2:
         length = jnp.sqrt(jnp.maximum(1 - t, 0) + self.softness)
         y = x / length
-        time = jnp.concatenate([jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))]), time_features(t, 4)])
+        time = jnp.concatenate(
+            [jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))]), time_features(t, 4)]
+        )
         return (self.network(t, y, v, theta) + self.gain(time.astype(x.dtype)) * y) / length
 
 
 class UNet(eqx.Module):
-    """The fully connected U-net of Baker et al. (2024), appendix: time enters every level, batch normalisation.
+    """The fully connected U-net of Baker et al. (2024), appendix: time enters every level, batch
+    normalisation.
 
-    Levels of two dense layers, down and up with skip connections, SiLU; the time embedding scales and shifts the first
-    layer of a level, which is residual. Build it with `UNet.build(...)`, which returns it `WithState`: batch
-    normalisation keeps running means.
+    Levels of two dense layers, down and up with skip connections, SiLU; the time embedding scales
+    and shifts the first layer of a level, which is residual. Build it with `UNet.build(...)`, which
+    returns it `WithState`: batch normalisation keeps running means.
 
-    **Arguments:** `shape`: of the state. `widths`: of the levels on the way down, `(8N, 4N, 2N, N)` in the paper.
-    `embedding`: size of the time embedding, and of the first layer.
+    **Arguments:** `shape`: of the state. `widths`: of the levels on the way down, `(8N, 4N, 2N, N)`
+    in the paper. `embedding`: size of the time embedding, and of the first layer.
     """
 
     inner: eqx.nn.Linear
@@ -139,17 +180,25 @@ class UNet(eqx.Module):
     outer: eqx.nn.Linear
     embedding: int = eqx.field(static=True)
 
-    def __init__(self, shape: tuple[int, int], widths: Sequence[int], embedding: int, *, key: PRNGKeyArray):
+    def __init__(
+        self, shape: tuple[int, int], widths: Sequence[int], embedding: int, *, key: PRNGKeyArray
+    ):
         size, widths, embedding = _checked(shape, widths, embedding, key)
         key_in, key_middle, key_out, *keys = jr.split(key, 3 + 2 * len(widths))
         self.embedding = embedding
         self.inner = _xavier(size, embedding, key_in)
         ins = [embedding, *widths[:-1]]
-        self.down = [_Level(a, b, embedding, key=k) for a, b, k in zip(ins, widths, keys[: len(widths)], strict=True)]
+        self.down = [
+            _Level(a, b, embedding, key=k)
+            for a, b, k in zip(ins, widths, keys[: len(widths)], strict=True)
+        ]
         self.middle = _xavier(widths[-1], widths[-1], key_middle)
         back = widths[::-1]
         ins = [back[0], *back[:-1]]
-        self.up = [_Level(a + b, b, embedding, key=k) for a, b, k in zip(ins, back, keys[len(widths) :], strict=True)]
+        self.up = [
+            _Level(a + b, b, embedding, key=k)
+            for a, b, k in zip(ins, back, keys[len(widths) :], strict=True)
+        ]
         self.outer = _xavier(widths[0], size, key_out)
 
     @classmethod
@@ -185,7 +234,9 @@ class UNet(eqx.Module):
 
 
 class _Level(eqx.Module):
-    """Two dense layers and batch normalisation; the first is residual, scaled and shifted by the time embedding."""
+    """Two dense layers and batch normalisation; the first is residual, scaled and shifted by the
+    time embedding.
+    """
 
     first: eqx.nn.Linear
     time: eqx.nn.Linear
@@ -206,10 +257,11 @@ class _Level(eqx.Module):
 
 
 class WithState(eqx.Module):
-    """A network that keeps state between batches, `network(t, x, v, theta, state)`, as `eqx.nn.make_with_state` gives.
+    """A network that keeps state between batches, `network(t, x, v, theta, state)`, as
+    `eqx.nn.make_with_state` gives.
 
-    Called, it is in inference mode. Its state is renewed by score matching on one problem; `"residual"`, and `draw`,
-    leave it as it is.
+    Called, it is in inference mode. Its state is renewed by score matching on one problem;
+    `"residual"`, and `draw`, leave it as it is.
     """
 
     network: Any
@@ -228,7 +280,9 @@ ROWWISE = (0, 0, None, None)
 
 
 def over_batch(network, t, x, v, theta, spread: Callable):
-    """Outputs of rows of (t, x), and the network with its state renewed, of all rows; `spread(fn, size)` maps."""
+    """Outputs of rows of (t, x), and the network with its state renewed, of all rows; `spread(fn,
+    size)` maps.
+    """
     if isinstance(network, WithState):
         mapped = jax.vmap(network.network, (*ROWWISE, None), (0, None), axis_name="batch")
         outputs, state = mapped(t, x, v, theta, network.state)
@@ -253,14 +307,18 @@ def _checked(shape, widths, embedding, key) -> tuple[int, list[int], int]:
         f"`widths` must be those of one level or more, such as (64, 32); got {words(widths)}.",
     )
     embedding = positive_integer(embedding, "embedding", least=2)
-    require(embedding % 2 == 0, f"`embedding` must be even, a cosine for each sine; got {embedding}.")
+    require(
+        embedding % 2 == 0, f"`embedding` must be even, a cosine for each sine; got {embedding}."
+    )
     return _size(shape), [positive_integer(width, "widths") for width in widths], embedding
 
 
 def _xavier(size_in: int, size: int, key: PRNGKeyArray) -> eqx.nn.Linear:
     """Glorot and Bengio's normal initialisation, biases 0."""
     linear = _zero(eqx.nn.Linear(size_in, size, key=key))
-    weight = jnp.sqrt(2.0 / (size_in + size)) * jr.normal(key, linear.weight.shape, linear.weight.dtype)
+    weight = jnp.sqrt(2.0 / (size_in + size)) * jr.normal(
+        key, linear.weight.shape, linear.weight.dtype
+    )
     return eqx.tree_at(lambda m: m.weight, linear, weight.astype(linear.weight.dtype))
 
 

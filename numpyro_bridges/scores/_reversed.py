@@ -1,13 +1,13 @@
 """The process that runs backwards.
 
-With time τ = t1 − t the reversed process has the drift −b + div a and the diffusion of the SDE. A solution h of
-the backward equation, read in τ, is its density weighted by exp ∫ c,
+With time τ = t1 − t the reversed process has the drift −b + div a and the diffusion of the SDE. A
+solution h of the backward equation, read in τ, is its density weighted by exp ∫ c,
 
     c = ½ ∇·div a − ∇·b,
 
-so that h(t, ·) is the law of a weighted cloud that starts at what is observed (Milstein, Schoenmakers and Spokoiny
-2004; Baker, Schauer and Sommer 2025). Guided by ∇log p(t, ·), the density of the SDE itself, it is the time reversal
-(Haussmann and Pardoux 1986).
+so that h(t, ·) is the law of a weighted cloud that starts at what is observed (Milstein,
+Schoenmakers and Spokoiny 2004; Baker, Schauer and Sommer 2025). Guided by ∇log p(t, ·), the density
+of the SDE itself, it is the time reversal (Haussmann and Pardoux 1986).
 """
 
 from jaxtyping import Array, Float
@@ -18,7 +18,9 @@ from ..spaces import AbstractSpace
 
 
 class ReversedSDE(AbstractSDE):
-    """dY = (−b + div a)(clock − τ, Y) dτ + σ(clock − τ, Y) dW, with clock the time at which it starts, t1."""
+    """dY = (−b + div a)(clock − τ, Y) dτ + σ(clock − τ, Y) dW, with clock the time at which it
+    starts, t1.
+    """
 
     sde: AbstractSDE
     clock: Float[Array, ""]
@@ -43,4 +45,6 @@ class ReversedSDE(AbstractSDE):
     def rate(self, t: RealScalar, x: State) -> Float[Array, ""]:
         """c."""
         t = self.clock - t
-        return 0.5 * self.sde.covariance_double_divergence(t, x) - divergence(lambda y: self.sde.drift(t, y), x)
+        return 0.5 * self.sde.covariance_double_divergence(t, x) - divergence(
+            lambda y: self.sde.drift(t, y), x
+        )

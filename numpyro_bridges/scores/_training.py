@@ -1,4 +1,6 @@
-"""The training loop: whole chunks of updates on the device, an average of the iterates, the best of which is kept."""
+"""The training loop: whole chunks of updates on the device, an average of the iterates, the best of
+which is kept.
+"""
 
 import hashlib
 import json
@@ -29,13 +31,15 @@ class Training(eqx.Module):
     **Arguments:**
 
     - `num_updates`: at most. `batch_size`: paths, or particles of a cloud, per update.
-    - `optimizer`: of optax; by default Adam with a warm-up of 50 updates and a cosine decay from `learning_rate`, the
-      gradient's norm clipped to 1.
-    - `average`: decay of the exponential average of the iterates, which is what is judged and returned; 0 is none.
+    - `optimizer`: of optax; by default Adam with a warm-up of 50 updates and a cosine decay from
+      `learning_rate`, the gradient's norm clipped to 1.
+    - `average`: decay of the exponential average of the iterates, which is what is judged and
+      returned; 0 is none.
     - `interval`: updates between looks at the held-out paths. `held_out`: their number.
-    - `patience`: looks without a better bound after which training stops; `None` does not stop and keeps the last
-      network in place of the best.
-    - `one_step`: the targets of score matching are those of one step, with all their noise, as was usual.
+    - `patience`: looks without a better bound after which training stops; `None` does not stop and
+      keeps the last network in place of the best.
+    - `one_step`: the targets of score matching are those of one step, with all their noise, as was
+      usual.
 
     `Training.published()` is the schedule of Baker et al. (2024).
     """
@@ -75,7 +79,11 @@ class Training(eqx.Module):
             )
             optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
         good = isinstance(optimizer, optax.GradientTransformation)
-        require(good, f"`optimizer` must be one of optax, such as `optax.adam(1e-3)`; got {words(optimizer)}.")
+        require(
+            good,
+            "`optimizer` must be one of optax, such as `optax.adam(1e-3)`; got "
+            f"{words(optimizer)}.",
+        )
         self.optimizer, self.average = optimizer, average
         self.patience = None if patience is None else positive_integer(patience, "patience")
         self.one_step = flag(one_step, "one_step")
@@ -92,7 +100,9 @@ class Training(eqx.Module):
             0.0, learning_rate, min(500, total // 2), total, 0.01 * learning_rate
         )
         settings = {"average": 0.0, "interval": 40, "patience": None, "one_step": True}
-        return cls(total, 50, learning_rate=learning_rate, optimizer=optax.adam(schedule), **settings)
+        return cls(
+            total, 50, learning_rate=learning_rate, optimizer=optax.adam(schedule), **settings
+        )
 
 
 def _rate(value: Any) -> float:
@@ -133,14 +143,16 @@ def train(
 ) -> tuple[Any, dict[str, Array]]:
     """The best network, and the history.
 
-    `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)`,
-    compiled, a value to be maximised, the bound and the ESS fraction on held-out paths, and what else it likes. A
-    network of a better value is kept unless its ESS is less than half of that of the one kept before: the bound
-    E log w is little moved by large weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the
-    same key gives the same network, however often training is resumed from `file`, which is refused where it was
-    written for another `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is
-    called at each look with the network that was looked at. Seconds are of the updates, compilation apart. The file is
-    written by the first process of `mesh`, over which the loss spreads its paths.
+    `loss(network, key)` gives the loss of a batch and the network with its own state renewed;
+    `judge(network)`, compiled, a value to be maximised, the bound and the ESS fraction on held-out
+    paths, and what else it likes. A network of a better value is kept unless its ESS is less than
+    half of that of the one kept before: the bound E log w is little moved by large weights, and may
+    rise where the ESS falls. Update i uses `fold_in(key, i)`: the same key gives the same network,
+    however often training is resumed from `file`, which is refused where it was written for another
+    `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is
+    called at each look with the network that was looked at. Seconds are of the updates, compilation
+    apart. The file is written by the first process of `mesh`, over which the loss spreads its
+    paths.
     """
     optimizer, decay = training.optimizer, training.average
     looks = -(-training.num_updates // training.interval) + 1
@@ -160,7 +172,10 @@ def train(
 
     @eqx.filter_jit
     def advance(state: _State) -> tuple[_State, Array]:
-        first, last = state.update, jnp.minimum(state.update + training.interval, training.num_updates)
+        first, last = (
+            state.update,
+            jnp.minimum(state.update + training.interval, training.num_updates),
+        )
 
         def update(i, carry):
             arrays, average, memory, losses = carry
@@ -188,8 +203,15 @@ def train(
         better = higher and not bool(ess < state.best_ess / 2)
         better = better or (training.patience is None and bool(value > -jnp.inf))
         i = -(-int(state.update) // training.interval)
-        history = {k: np.array(v) for k, v in state.history.items()}  # NumPy: each length would be another program
-        row = {"update": float(state.update), "loss": loss_value, "bound": bound, "ess": ess, "seconds": seconds}
+        # NumPy: each length would be another program
+        history = {k: np.array(v) for k, v in state.history.items()}
+        row = {
+            "update": float(state.update),
+            "loss": loss_value,
+            "bound": bound,
+            "ess": ess,
+            "seconds": seconds,
+        }
         for name, number in row.items():
             history[name][i] = number
         return eqx.tree_at(
@@ -221,15 +243,18 @@ def train(
     compiled = advance.lower(state).compile()
     show(state)
     spent = float(np.nanmax(np.asarray(state.history["seconds"])))
-    with tqdm(total=training.num_updates, initial=int(state.update), desc=name, disable=not progress) as bar:
+    with tqdm(
+        total=training.num_updates, initial=int(state.update), desc=name, disable=not progress
+    ) as bar:
         while int(state.update) < training.num_updates and not _stopped(state, training):
             begin = time.perf_counter()
             new, losses = gather(jax.block_until_ready(compiled(state)))
             if not bool(jnp.all(jnp.isfinite(losses))):
                 first = int(state.update) + int(jnp.argmax(~jnp.isfinite(losses)))
                 warnings.warn(
-                    f"{name} stopped: the loss was not finite at update {first}. The network is the best of those "
-                    "before; a smaller `learning_rate` or more time steps may help.",
+                    f"{name} stopped: the loss was not finite at update {first}. The network is "
+                    "the best of those before; a smaller `learning_rate` or more time steps may "
+                    "help.",
                     stacklevel=3,
                 )
                 break
@@ -239,7 +264,9 @@ def train(
             if file is not None and is_writer(mesh):
                 _save(file, state, label)
             row = {k: float(np.asarray(v)[-1]) for k, v in rows(state).items()}
-            bar.set_postfix_str(f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %")
+            bar.set_postfix_str(
+                f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %"
+            )
             bar.update(done)
             show(state)
     return eqx.combine(state.best, static), rows(state)
@@ -249,10 +276,17 @@ def _stopped(state: _State, training: Training) -> bool:
     return training.patience is not None and int(state.waited) >= training.patience
 
 
-def _label(name: str, problem: Any, network: Any, key: PRNGKeyArray, training: Training) -> dict[str, Any]:
+def _label(
+    name: str, problem: Any, network: Any, key: PRNGKeyArray, training: Training
+) -> dict[str, Any]:
     """What a saved training belongs to. An optimizer is known by the shape of its state only."""
     settings = {k: v for k, v in vars(training).items() if k != "optimizer"}
-    label = {"method": name, "problem": _digest(problem), "network": _digest(network), "key": _digest(key)}
+    label = {
+        "method": name,
+        "problem": _digest(problem),
+        "network": _digest(network),
+        "key": _digest(key),
+    }
     return label | {f"training.{k}": v for k, v in settings.items()}
 
 
@@ -286,7 +320,7 @@ def _load(file: Path, state: _State, label: dict[str, Any]) -> _State:
         other = [k for k in label if saved.get(k) != label[k]]
         require(
             not other,
-            f"`directory` holds the training of something else: {file} differs in {', '.join(other)}. Repeat the call "
-            "that began it, or give another directory.",
+            f"`directory` holds the training of something else: {file} differs in "
+            f"{', '.join(other)}. Repeat the call that began it, or give another directory.",
         )
         return eqx.tree_deserialise_leaves(f, state)

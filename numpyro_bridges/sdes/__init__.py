@@ -12,7 +12,11 @@ from ._base import (
 from ._flattened import Flattened as Flattened, for_every_column as for_every_column
 from ._grid import TimeGrid as TimeGrid, time_grid as time_grid
 from ._kunita import KunitaFlow as KunitaFlow
-from ._linear import BrownianMotion as BrownianMotion, LinearSDE as LinearSDE, as_covariance as as_covariance
+from ._linear import (
+    BrownianMotion as BrownianMotion,
+    LinearSDE as LinearSDE,
+    as_covariance as as_covariance,
+)
 from ._noise import (
     AbstractNoise as AbstractNoise,
     ControlNoise as ControlNoise,

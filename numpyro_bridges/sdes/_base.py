@@ -1,6 +1,8 @@
-"""A stochastic differential equation on H, dX = b(t, X) dt + σ(t, X) dW (Itô), and its one-step Gaussian transition.
+"""A stochastic differential equation on H, dX = b(t, X) dt + σ(t, X) dW (Itô), and its one-step
+Gaussian transition.
 
-States are `(n, dim)` or `(n,)`; σ acts on the first axis, so a = σσᵀ is n × n and the same for every column.
+States are `(n, dim)` or `(n,)`; σ acts on the first axis, so a = σσᵀ is n × n and the same for
+every column.
 """
 
 import abc
@@ -27,8 +29,8 @@ _MAX_LINEARISED = 64
 class Transition(eqx.Module):
     """One step of the time-discretised model, x' = start + increment + factor u with u ~ N(0, I).
 
-    `covariance` is factor factorᵀ. The increment is held, and not the mean, since a step may be short beside the state:
-    bridges add it to what is left of the way to the observed end.
+    `covariance` is factor factorᵀ. The increment is held, and not the mean, since a step may be
+    short beside the state: bridges add it to what is left of the way to the observed end.
     """
 
     start: State
@@ -67,7 +69,9 @@ class DiffusionTerm(diffrax.AbstractTerm):
 
 
 class AbstractSDE(eqx.Module):
-    """dX = b(t, X) dt + σ(t, X) dW. A subclass gives `drift` and `noise`; parameters are array leaves."""
+    """dX = b(t, X) dt + σ(t, X) dW. A subclass gives `drift` and `noise`; parameters are array
+    leaves.
+    """
 
     if TYPE_CHECKING:  # no argument of a constructor, and a subclass may make it a property
 
@@ -79,7 +83,9 @@ class AbstractSDE(eqx.Module):
     """Where states live; `None` is Euclidean space."""
 
     has_exact_transition: ClassVar[bool] = False
-    """Whether a step of any length has its exact law, so that one is enough where nothing happens on the way."""
+    """Whether a step of any length has its exact law, so that one is enough where nothing happens
+    on the way.
+    """
 
     @abc.abstractmethod
     def drift(self, t: RealScalar, x: State) -> State:
@@ -94,11 +100,17 @@ class AbstractSDE(eqx.Module):
         """Whether a(t, x) is known not to depend on x; decides the default guide."""
 
     def is_autonomous(self, x: State) -> bool:
-        """Whether b and σ are known not to depend on t; such an SDE is shown the time that has elapsed since t0."""
+        """Whether b and σ are known not to depend on t; such an SDE is shown the time that has
+        elapsed since t0.
+        """
         return not depends_on(lambda t, y: (self.drift(t, y), self.noise(t, y)), x, 0)
 
-    def frame(self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar) -> "Frame":
-        """Displacements from `end`. An SDE whose noise-free path is known may let the origin move along it."""
+    def frame(
+        self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar
+    ) -> "Frame":
+        """Displacements from `end`. An SDE whose noise-free path is known may let the origin move
+        along it.
+        """
         return still_frame(self, x0, end, elapsed, clock)
 
     def diffusion(self, t: RealScalar, x: State) -> Structured:
@@ -130,7 +142,8 @@ class AbstractSDE(eqx.Module):
         return divergence(lambda y: self.covariance_divergence(t, y), x)
 
     def closed(self, t: RealScalar, x: State) -> "AbstractSDE":
-        """The same SDE for states shaped like x, with what a user's functions read frozen as it is now.
+        """The same SDE for states shaped like x, with what a user's functions read frozen as it is
+        now.
 
         An SDE whose coefficients are computed from its own leaves is that already.
         """
@@ -156,7 +169,8 @@ class AbstractSDE(eqx.Module):
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         """B and β with b(t, y) ≈ B y + β near x; B = 0 for states of more than 64 numbers.
 
-        B acts on the first axis: for `dim` > 1 it is the mean over columns of the Jacobian's diagonal blocks.
+        B acts on the first axis: for `dim` > 1 it is the mean over columns of the Jacobian's
+        diagonal blocks.
         """
         b = self.drift(t, x)
         if x.size > _MAX_LINEARISED:
@@ -172,43 +186,56 @@ class AbstractSDE(eqx.Module):
         operator = add(jnp.ones((), x.dtype), dt * B)
         return AffineStep(operator, dt * beta, dt * self.covariance(t0, x))
 
-    def auxiliary_step(self, auxiliary: "AbstractSDE", t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+    def auxiliary_step(
+        self, auxiliary: "AbstractSDE", t0: RealScalar, t1: RealScalar, x: State
+    ) -> AffineStep:
         """A linear auxiliary process, stepped by the scheme that steps this SDE."""
         dt = t1 - t0
         B, beta = auxiliary.linearised_drift(t0, x)
-        return AffineStep(add(jnp.ones((), x.dtype), dt * B), dt * beta, dt * auxiliary.covariance(t0, x))
+        return AffineStep(
+            add(jnp.ones((), x.dtype), dt * B), dt * beta, dt * auxiliary.covariance(t0, x)
+        )
 
     def ito_is_stratonovich(self, x: State) -> bool:
-        """Whether the Itô and the Stratonovich reading coincide, so that Stratonovich solvers are right too."""
+        """Whether the Itô and the Stratonovich reading coincide, so that Stratonovich solvers are
+        right too.
+        """
         return self.has_constant_covariance(x)
 
     def terms(self, control: diffrax.AbstractPath) -> diffrax.MultiTerm:
         """diffrax terms, driven by `control` with values `(k, dim)`."""
         return diffrax.MultiTerm(
-            diffrax.ODETerm(lambda t, y, args: self.drift(jnp.asarray(t), y)), DiffusionTerm(self.diffusion, control)
+            diffrax.ODETerm(lambda t, y, args: self.drift(jnp.asarray(t), y)),
+            DiffusionTerm(self.diffusion, control),
         )
 
     def start(self, x: State) -> State:
-        """x, a start; NaN, which is seen in every weight, where `check_state` would refuse it but x is traced."""
+        """x, a start; NaN, which is seen in every weight, where `check_state` would refuse it but x
+        is traced.
+        """
         return x
 
     def check_end(self, find: Callable[[], State]) -> None:
-        """Warns where the state that `find()` returns, to which paths are led, is beyond what the SDE can represent."""
+        """Warns where the state that `find()` returns, to which paths are led, is beyond what the
+        SDE can represent.
+        """
         return None
 
     def check_state(self, x: State) -> None:
-        """`ValueError` where x cannot be a state of this SDE. Coefficients are traced, at no time in particular."""
+        """`ValueError` where x cannot be a state of this SDE. Coefficients are traced, at no time
+        in particular.
+        """
         require_space(self.space, x)
         factor, drift = at_any_time(lambda t, y: (self.diffusion(t, y), self.drift(t, y)), x)
         if drift.shape != x.shape:
             raise ValueError(
-                f"`drift` must return an array shaped like the state, {x.shape}; got {drift.shape}. "
-                "A parameter with a batch axis does this too: vmap over it."
+                f"`drift` must return an array shaped like the state, {x.shape}; got "
+                f"{drift.shape}. A parameter with a batch axis does this too: vmap over it."
             )
         if factor.shape and (factor.shape[0] != x.shape[0] or 0 in factor.shape):
             raise ValueError(
-                f"`diffusion` must be a scalar, a diagonal ({x.shape[0]},) or a matrix ({x.shape[0]}, k); "
-                f"got {factor.shape} for a state {x.shape}."
+                f"`diffusion` must be a scalar, a diagonal ({x.shape[0]},) or a matrix "
+                f"({x.shape[0]}, k); got {factor.shape} for a state {x.shape}."
             )
 
 
@@ -224,9 +251,11 @@ class Frame(NamedTuple):
 
 
 class Displaced(AbstractSDE):
-    """The process Y = X − origin of an SDE, in the time that has elapsed: `clock` is added to it before `sde` is asked.
+    """The process Y = X − origin of an SDE, in the time that has elapsed: `clock` is added to it
+    before `sde` is asked.
 
-    y keeps its digits where it is small beside x; x = origin + y is formed only to evaluate b and σ there.
+    y keeps its digits where it is small beside x; x = origin + y is formed only to evaluate b and σ
+    there.
     """
 
     sde: AbstractSDE
@@ -310,7 +339,9 @@ def depends_on(f: Callable, x: State, argument: int) -> bool:
 
 
 def at_any_time(coefficient: Callable, x: State):
-    """Shapes of a coefficient (t, x), which may be defined on [t0, t1] only: the time is traced, and no number."""
+    """Shapes of a coefficient (t, x), which may be defined on [t0, t1] only: the time is traced,
+    and no number.
+    """
     time = jax.ShapeDtypeStruct((), x.dtype)
     # a new function at each call: JAX keeps shapes by the function
     return jax.eval_shape(lambda t, y: coefficient(t, y), time, x)
@@ -320,13 +351,15 @@ def require_space(space: AbstractSpace | None, x: State | None = None) -> None:
     """`space` is a space or `None`, and x is one of its states."""
     if space is None:
         return
-    require_instance(space, AbstractSpace, "space", "a space, such as `Landmarks(num_points, dim)`, or `None`")
+    require_instance(
+        space, AbstractSpace, "space", "a space, such as `Landmarks(num_points, dim)`, or `None`"
+    )
     if x is not None:
         shape = (space.size, space.dim)
         require(
             x.shape == shape or (x.shape == shape[:1] and space.dim == 1),
-            f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}. Give the space of these states, "
-            "or none.",
+            f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}. Give the "
+            "space of these states, or none.",
         )
 
 

@@ -1,6 +1,7 @@
 """Exponential steps: what is linear is stepped by its exact law, what is not is held over the step.
 
-    dX = (A X + β) dt + σ dW:   X_{t+τ} | X_t ~ N(e^{Aτ} X_t + ∫₀^τ e^{Au} β du,  ∫₀^τ e^{Au} σσᵀ e^{Aᵀu} du)
+    dX = (A X + β) dt + σ dW:   X_{t+τ} | X_t ~ N(e^{Aτ} X_t + ∫₀^τ e^{Au} β du,  ∫₀^τ e^{Au} σσᵀ
+    e^{Aᵀu} du)
 
 The integrals are elementwise for a scalar or diagonal A, and by series and doubling otherwise.
 """
@@ -28,27 +29,33 @@ _TERMS, _DOUBLINGS = 22, 20
 """Of the series, at a norm of at most 1, and of the step: B dt up to 2^20."""
 _ROOTS, _GAUSS = np.polynomial.legendre.leggauss(10)
 _NODES, _WEIGHTS = 0.5 + 0.5 * _ROOTS, 0.5 * _GAUSS
-"""Gauss–Legendre on [0, 1]: exact for polynomials of degree 19, so to the last digit for e^{sx} within |x| = 1."""
+"""Gauss–Legendre on [0, 1]: exact for polynomials of degree 19, so to the last digit for e^{sx}
+within |x| = 1.
+"""
 
 
 def _phi1(x: Array) -> Array:
     """φ₁(x) = (eˣ − 1)/x = ∫₀¹ e^{sx} ds, with its derivatives of every order.
 
-    Those of the quotient lose their digits near 0, at 0 half their value; within 1 the integral by quadrature has them.
+    Those of the quotient lose their digits near 0, at 0 half their value; within 1 the integral by
+    quadrature has them.
     """
     near = jnp.abs(x) < 1
     small, large = jnp.where(near, x, 0.0), jnp.where(near, 1.0, x)
-    nodes, weights = (jnp.asarray(a, x.dtype).reshape((1,) * x.ndim + (-1,)) for a in (_NODES, _WEIGHTS))
+    nodes, weights = (
+        jnp.asarray(a, x.dtype).reshape((1,) * x.ndim + (-1,)) for a in (_NODES, _WEIGHTS)
+    )
     integral = jnp.sum(weights * jnp.exp(nodes * small[..., None]), axis=-1)
     return jnp.where(near, integral, jnp.expm1(large) / large)
 
 
 def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array, Array, Array]:
-    """e^{Bτ} − 1, ∫₀^τ e^{Bu} β du and ∫₀^τ e^{Bu} a e^{Bᵀu} du at τ = dt: Taylor series at dt/2^k, then k doublings.
+    """e^{Bτ} − 1, ∫₀^τ e^{Bu} β du and ∫₀^τ e^{Bu} a e^{Bᵀu} du at τ = dt: Taylor series at dt/2^k,
+    then k doublings.
 
-    The block exponential of Van Loan (1978) holds e^{−Bτ} beside e^{Bτ} and loses the covariance of a stiff equation to
-    cancellation, 0.1 at Bτ = 40; a doubling is a sum of covariances. To double e^{Bτ} − 1 keeps the digits that e^{Bτ}
-    would lose in small steps. NaN where Bτ is beyond 2^20.
+    The block exponential of Van Loan (1978) holds e^{−Bτ} beside e^{Bτ} and loses the covariance of
+    a stiff equation to cancellation, 0.1 at Bτ = 40; a doubling is a sum of covariances. To double
+    e^{Bτ} − 1 keeps the digits that e^{Bτ} would lose in small steps. NaN where Bτ is beyond 2^20.
     """
     one = jnp.ones((), B.dtype)
     norm = jnp.max(jnp.sum(jnp.abs(B), axis=0)) * dt
@@ -70,7 +77,11 @@ def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array
     def double(totals, i):
         E, shift, S = totals
         ES = product(E, S)
-        doubled = (2 * E + product(E, E), 2 * shift + product(E, shift), 2 * S + ES + ES.T + product(ES, E.T))
+        doubled = (
+            2 * E + product(E, E),
+            2 * shift + product(E, shift),
+            2 * S + ES + ES.T + product(ES, E.T),
+        )
         return jax.tree.map(lambda new, old: jnp.where(i < k, new, old), doubled, totals), None
 
     (E, shift, S), _ = jax.lax.scan(double, totals, jnp.arange(_DOUBLINGS, dtype=B.dtype))
@@ -78,7 +89,9 @@ def _affine_flow(B: Array, beta: Array, a: Array, dt: RealScalar) -> tuple[Array
 
 
 def _psd_cholesky(S: Structured) -> Structured:
-    """Cholesky factor of a covariance that may be singular: a nugget of a few rounding errors per diagonal entry."""
+    """Cholesky factor of a covariance that may be singular: a nugget of a few rounding errors per
+    diagonal entry.
+    """
     if S.ndim < 2:
         return semidefinite_cholesky(S)
     d = jnp.diagonal(S)

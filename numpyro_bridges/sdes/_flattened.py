@@ -1,4 +1,4 @@
-"""A process whose columns stand one below the other, for what is seen of several columns together."""
+"""A process whose columns are one below the other, for what is seen of several together."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,8 @@ from ._base import AbstractSDE, AffineStep, Transition
 
 
 class Flattened(AbstractSDE):
-    """Y = X.reshape(-1) of a process X with states `(n, dim)`: entry i · dim + d of y is column d of row i.
+    """Y = X.reshape(-1) of a process X with states `(n, dim)`: entry i · dim + d of y is column d
+    of row i.
 
     Columns of X have independent noises and share σ, a and every linear map; those of Y are their
     Kronecker products with the identity. A condition may see all entries of y at once.

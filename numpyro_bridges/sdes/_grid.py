@@ -1,7 +1,8 @@
 """Time grids.
 
-A grid holds its start t0 and the times that have *elapsed* since: at a large t0, days or seconds since 1970, single
-precision has no digits left for the steps. What is known is prepared in double precision, whatever the default.
+A grid holds its start t0 and the times that have *elapsed* since: at a large t0, days or seconds
+since 1970, single precision has no digits left for the steps. What is known is prepared in double
+precision, whatever the default.
 """
 
 from typing import Any
@@ -19,7 +20,9 @@ _PRECISION = 'or use double precision: `jax.config.update("jax_enable_x64", True
 
 
 class TimeGrid(eqx.Module):
-    """The times t0 + `elapsed` `(K + 1,)`, the first elapsed time being 0. As an array it is its times."""
+    """The times t0 + `elapsed` `(K + 1,)`, the first elapsed time being 0. As an array it is its
+    times.
+    """
 
     t0: Any
     """A NumPy number of double precision where it is known."""
@@ -32,7 +35,7 @@ class TimeGrid(eqx.Module):
 
     @property
     def ts(self) -> Array | np.ndarray:
-        """The times; a NumPy array of double precision where the default would lose their digits."""
+        """The times, a NumPy array in double precision where the default would lose digits."""
         begin, elapsed = concrete(self.t0), concrete(self.elapsed)
         if begin is None or elapsed is None:
             begin = jnp.asarray(self.t0, self.elapsed.dtype)
@@ -49,7 +52,8 @@ class TimeGrid(eqx.Module):
         return jnp.asarray(time, dtype) - jnp.asarray(self.t0, dtype)
 
     def clock(self, sde: AbstractSDE, x: State) -> Float[Array, ""]:
-        """What is added to the elapsed time that an SDE is shown: t0, or 0 where the time makes no difference to it.
+        """What is added to the elapsed time that an SDE is shown: t0, or 0 where the time makes no
+        difference to it.
 
         `ValueError` if its steps then vanish in the precision used.
         """
@@ -60,9 +64,10 @@ class TimeGrid(eqx.Module):
             shown = begin.astype(dtype) + elapsed
             require(
                 np.all(np.diff(shown) > 0),
-                f"`t0` must leave the steps their digits, since this SDE depends on the time: from t0 = {begin} on, "
-                f"times in {dtype} are {np.spacing(np.abs(shown).max())} apart, and the shortest step has length "
-                f"{np.diff(elapsed).min()}. Give its times from the start on, {_PRECISION}",
+                "`t0` must leave the steps their digits, since this SDE depends on the time: from "
+                f"t0 = {begin} on, times in {dtype} are {np.spacing(np.abs(shown).max())} apart, "
+                f"and the shortest step has length {np.diff(elapsed).min()}. Give its times from "
+                f"the start on, {_PRECISION}",
             )
         return jnp.asarray(self.t0, dtype)
 
@@ -78,17 +83,24 @@ def time_grid(
     *,
     graded: bool = False,
 ) -> TimeGrid:
-    """The user's grid, checked, or the default one: uniform, or graded towards t1 as t = s(2 − s/T)."""
+    """The user's grid, checked, or the default one: uniform, or graded towards t1 as t = s(2 −
+    s/T).
+    """
     if ts is not None:
-        require(num_steps is None, f"Give `num_steps` or `ts`, not both; got num_steps = {num_steps}.")
+        require(
+            num_steps is None, f"Give `num_steps` or `ts`, not both; got num_steps = {num_steps}."
+        )
         return given_grid(ts, t0, t1)
     if t1 is None or num_steps is None:
-        raise ValueError(f"Give `t1` and `num_steps`, or a grid `ts`; got t1 = {t1}, num_steps = {num_steps}.")
+        raise ValueError(
+            f"Give `t1` and `num_steps`, or a grid `ts`; got t1 = {t1}, num_steps = {num_steps}."
+        )
     num_steps = positive_integer(num_steps, "num_steps")
     begin, end = exact_float(0.0 if t0 is None else t0, "t0"), exact_float(t1, "t1")
     require(
         begin.ndim == 0 and end.ndim == 0,
-        f"`t0` and `t1` must be one time each; got shapes {begin.shape} and {end.shape}. Use vmap for a batch.",
+        f"`t0` and `t1` must be one time each; got shapes {begin.shape} and {end.shape}. Use vmap "
+        "for a batch.",
     )
     require(
         jnp.isfinite(begin) & jnp.isfinite(end) & (end > begin),
@@ -117,7 +129,8 @@ def given_grid(ts, t0: RealScalar | None = None, t1: RealScalar | None = None) -
         require_finite(ts, "ts")
         require(
             np.all(np.diff(ts) > 0),
-            f"`ts` must increase strictly; a step has length {np.diff(ts).min()}. Sort it and remove repeated times.",
+            f"`ts` must increase strictly; a step has length {np.diff(ts).min()}. Sort it and "
+            "remove repeated times.",
         )
     for name, given, place, verb in (("t1", t1, -1, "end"), ("t0", t0, 0, "begin")):
         if given is None:
@@ -126,7 +139,8 @@ def given_grid(ts, t0: RealScalar | None = None, t1: RealScalar | None = None) -
         close = known and isinstance(given, np.ndarray)
         require(
             not close or given.ndim == 0 and np.abs(ts[place] - given) <= 1e-5 * (ts[-1] - ts[0]),
-            f"`ts` must {verb} at `{name}`; got ts[{place}] = {ts[place]} and {name} = {given}. Give only `ts`.",
+            f"`ts` must {verb} at `{name}`; got ts[{place}] = {ts[place]} and {name} = {given}. "
+            "Give only `ts`.",
         )
     return _grid(np.asarray(ts[0]) if known else ts[0], ts - ts[0], "`ts`")
 
@@ -142,7 +156,7 @@ def _require_steps(elapsed: np.ndarray, name: str) -> None:
     rounded = elapsed.astype(jnp.result_type(float))
     require(
         np.all(np.diff(rounded) > 0),
-        f"{name} must leave steps that can be told apart: at the end, times in {rounded.dtype} are "
-        f"{np.spacing(rounded[-1])} apart, and the shortest step has length {np.diff(elapsed).min()}. Take fewer "
-        f"steps, or longer ones, {_PRECISION}",
+        f"{name} must leave steps that can be told apart: at the end, times in {rounded.dtype} "
+        f"are {np.spacing(rounded[-1])} apart, and the shortest step has length "
+        f"{np.diff(elapsed).min()}. Take fewer steps, or longer ones, {_PRECISION}",
     )

@@ -1,8 +1,9 @@
-"""The Kunita flow of shapes, dX(t, s) = ∫ k(X(t, s), y) dW(t, y): points carried by a Gaussian field of noise.
+"""The Kunita flow of shapes, dX(t, s) = ∫ k(X(t, s), y) dW(t, y): points carried by a Gaussian
+field of noise.
 
-The covariance of two points is a(x, x') = ∫ k(x, y) k(x', y) dy, for the Gaussian kernel in R^d
-α² (πℓ²)^{d/2} exp(−|x − x'|²/4ℓ²); the coordinates are independent given the points. Kunita (1997); for shapes
-Sommer, Schauer, van der Meulen (2021), and Baker et al. (2024), section 2.
+The covariance of two points is a(x, x') = ∫ k(x, y) k(x', y) dy, for the Gaussian kernel in R^d α²
+(πℓ²)^{d/2} exp(−|x − x'|²/4ℓ²); the coordinates are independent given the points. Kunita (1997);
+for shapes Sommer, Schauer, van der Meulen (2021), and Baker et al. (2024), section 2.
 """
 
 import warnings
@@ -38,13 +39,15 @@ class KunitaFlow(AbstractSDE):
 
     **Arguments:**
 
-    - `space`: `Landmarks` or `FourierBasis`; with the latter the noise field is evaluated at the basis's quadrature
-      points and projected.
+    - `space`: `Landmarks` or `FourierBasis`; with the latter the noise field is evaluated at the
+      basis's quadrature points and projected.
     - `kernel`: k, which is convolved with itself; or
-    - `covariance`: the covariance function a itself (some of the literature writes its kernel there).
-    - `noise`: `"landmark"`, `"control"` (both for landmarks), `"spectral"`, `"grid"`, or a `LandmarkNoise`,
-      `ControlNoise`, `SpectralNoise`, `GridNoise` with its own settings. By default `"landmark"`, which is exact, and
-      `"control"` for more than 64 landmarks, which costs as much as they are many.
+    - `covariance`: the covariance function a itself (some of the literature writes its kernel
+      there).
+    - `noise`: `"landmark"`, `"control"` (both for landmarks), `"spectral"`, `"grid"`, or a
+      `LandmarkNoise`, `ControlNoise`, `SpectralNoise`, `GridNoise` with its own settings. By
+      default `"landmark"`, which is exact, and `"control"` for more than 64 landmarks, which costs
+      as much as they are many.
     """
 
     space: AbstractSpace
@@ -62,25 +65,42 @@ class KunitaFlow(AbstractSDE):
     ):
         require(
             (kernel is None) != (covariance is None),
-            "Give either `kernel`, which is convolved with itself, or `covariance`, the covariance function itself; "
-            f"got {'both' if kernel is not None else 'neither'}.",
+            "Give either `kernel`, which is convolved with itself, or `covariance`, the "
+            f"covariance function itself; got {'both' if kernel is not None else 'neither'}.",
         )
-        require_instance(space, AbstractSpace, "space", "a space, such as `Landmarks(num_points, dim)`")
+        require_instance(
+            space, AbstractSpace, "space", "a space, such as `Landmarks(num_points, dim)`"
+        )
         for name, k in (("kernel", kernel), ("covariance", covariance)):
             if k is not None:
-                require_instance(k, AbstractKernel, name, "a kernel, such as `GaussianKernel(amplitude, length_scale)`")
+                require_instance(
+                    k,
+                    AbstractKernel,
+                    name,
+                    "a kernel, such as `GaussianKernel(amplitude, length_scale)`",
+                )
         if noise is None:
-            noise = "control" if isinstance(space, Landmarks) and space.size > MOST_CONTROLS else "landmark"
+            noise = (
+                "control"
+                if isinstance(space, Landmarks) and space.size > MOST_CONTROLS
+                else "landmark"
+            )
         if isinstance(noise, str):
-            require(noise in NOISES, f"`noise` must be one of {sorted(NOISES)} or a noise object; got {noise!r}.")
+            require(
+                noise in NOISES,
+                f"`noise` must be one of {sorted(NOISES)} or a noise object; got {noise!r}.",
+            )
             noise_field: AbstractNoise = NOISES[noise]()
         else:
-            require_instance(noise, AbstractNoise, "noise", f"one of {sorted(NOISES)} or a noise object")
+            require_instance(
+                noise, AbstractNoise, "noise", f"one of {sorted(NOISES)} or a noise object"
+            )
             noise_field = noise
         require(
             isinstance(space, Landmarks) or noise_field.fixed_in_space,
-            f'`noise="{name_of(noise_field)}"` is attached to landmarks, and the coefficients of a `FourierBasis` are '
-            'none: their covariance has no points to be factored at. Use `noise="spectral"` or `noise="grid"`.',
+            f'`noise="{name_of(noise_field)}"` is attached to landmarks, and the coefficients of a '
+            "`FourierBasis` are none: their covariance has no points to be factored at. Use "
+            '`noise="spectral"` or `noise="grid"`.',
         )
         if kernel is not None:
             covariance = kernel.convolved(space.dim)
@@ -100,7 +120,9 @@ class KunitaFlow(AbstractSDE):
         return jnp.zeros_like(x)
 
     def noise(self, t: RealScalar, x: State) -> tuple[Structured, Structured]:
-        sigma, a = self.noise_field.factor_and_covariance(self.kernel, self.covariance_kernel, self.space.to_points(x))
+        sigma, a = self.noise_field.factor_and_covariance(
+            self.kernel, self.covariance_kernel, self.space.to_points(x)
+        )
         if isinstance(self.space, Landmarks):
             return sigma, a
         sigma = self.space.from_points(sigma)
@@ -143,18 +165,20 @@ class KunitaFlow(AbstractSDE):
     def noise_error(self, x: ArrayLike | None = None) -> dict:
         """What noise that is not exact gets wrong, relative to a(x, x); empty for landmark noise.
 
-        **Arguments:** `x`: a state, or a path `(K + 1, n, dim)`, of which the worst state counts. Without it spectral
-        noise answers for shapes of its `diameter`.
+        **Arguments:** `x`: a state, or a path `(K + 1, n, dim)`, of which the worst state counts.
+        Without it spectral noise answers for shapes of its `diameter`.
 
-        **Returns:** a dictionary. Of control noise at x, `missing`, the variance that the controls, those of a bridge
-        from the first state if they are not given, do not tell at the worst landmark. Of spectral noise, `tail`, the
-        variance that is missing at each point for want of modes, and `wrap_around`, the covariance of the ends of the
-        shape through the periodic image. Of grid noise at x, `edge`, the variance that is lost where points are too
-        near the edge of the box, and `quadrature`, the whole error of a(x, x). A `UserWarning` says which of them are
-        above 1 %.
+        **Returns:** a dictionary. Of control noise at x, `missing`, the variance that the controls,
+        those of a bridge from the first state if they are not given, do not tell at the worst
+        landmark. Of spectral noise, `tail`, the variance that is missing at each point for want of
+        modes, and `wrap_around`, the covariance of the ends of the shape through the periodic
+        image. Of grid noise at x, `edge`, the variance that is lost where points are too near the
+        edge of the box, and `quadrature`, the whole error of a(x, x). A `UserWarning` says which of
+        them are above 1 %.
 
-        A start with 10 % or more of `missing`, `wrap_around` or `edge` is refused. A path that comes to half of
-        a(x, x), at the edge of a box, is NaN from there on, and so is its weight; what lies between is seen here only.
+        A start with 10 % or more of `missing`, `wrap_around` or `edge` is refused. A path that
+        comes to half of a(x, x), at the edge of a box, is NaN from there on, and so is its weight;
+        what lies between is seen here only.
         """
         points = None
         if x is not None:
@@ -162,13 +186,20 @@ class KunitaFlow(AbstractSDE):
             shape = (self.space.size, self.space.dim)
             require(
                 x.ndim in (2, 3) and x.shape[-2:] == shape,
-                f"`x` must be a state {shape} or a path of them; got {x.shape}. Use vmap for a batch.",
+                f"`x` must be a state {shape} or a path of them; got {x.shape}. Use vmap for a "
+                "batch.",
             )
             points = jax.vmap(self.space.to_points)(x.reshape(-1, *shape))
         error = self.noise_field.error(self.kernel, self.covariance_kernel, self.space.dim, points)
-        large = [f"{name} {float(e):.2g}" for name, e in error.items() if concrete(e) is not None and e > _SEEN]
+        large = [
+            f"{name} {float(e):.2g}"
+            for name, e in error.items()
+            if concrete(e) is not None and e > _SEEN
+        ]
         if large:
-            warnings.warn(f"the noise is wrong by more than 1 % of a(x, x): {', '.join(large)}.", stacklevel=2)
+            warnings.warn(
+                f"the noise is wrong by more than 1 % of a(x, x): {', '.join(large)}.", stacklevel=2
+            )
         return error
 
     def point_sd(self, t: RealScalar = 1.0) -> Float[Array, ""]:
@@ -176,9 +207,9 @@ class KunitaFlow(AbstractSDE):
 
         It is what an amplitude means, in the units of the shapes: for the Gaussian kernel in the
         plane √(π t) αℓ. It is exact at every t, as a point that the flow carries is a martingale
-        whose noise has the covariance a(x, x) wherever it is. What spectral or grid noise leaves out
-        of a(x, x), `noise_error` says; a point of a curve in a `FourierBasis` moves less, by what the
-        basis leaves out of the noise.
+        whose noise has the covariance a(x, x) wherever it is. What spectral or grid noise leaves
+        out of a(x, x), `noise_error` says; a point of a curve in a `FourierBasis` moves less, by
+        what the basis leaves out of the noise.
 
         **Arguments:** `t`: from 0 on.
         """
@@ -191,16 +222,23 @@ class KunitaFlow(AbstractSDE):
         return jnp.sqrt(t * self.covariance_kernel.variance.astype(t.dtype))
 
     def carry(
-        self, path: Float[Array, "K+1 n dim"], points: Float[Array, "q dim"], *, inverse: bool = False
+        self,
+        path: Float[Array, "K+1 n dim"],
+        points: Float[Array, "q dim"],
+        *,
+        inverse: bool = False,
     ) -> Float[Array, "K+1 q dim"]:
-        """The flow that a path of landmarks belongs to, applied to any further points: where they are at its times.
+        """The flow that a path of landmarks belongs to, applied to any further points: where they
+        are at its times.
 
-        In a step a point p moves by the field that moves the landmarks, a(p, c) a(c, c)⁻¹ Δc, c being the landmarks
-        that drive the flow, all or the controls; of spectral or grid noise the field of least noise. Points that are
-        landmarks of the path move as these do, to the last digit.
+        In a step a point p moves by the field that moves the landmarks, a(p, c) a(c, c)⁻¹ Δc, c
+        being the landmarks that drive the flow, all or the controls; of spectral or grid noise the
+        field of least noise. Points that are landmarks of the path move as these do, to the last
+        digit.
 
-        **Arguments:** `path`: the states of a bridge, or of one branch of a tree. `points`: at the first time, or,
-        where `inverse`, at the last: then the way back, by solving each step for the point that it moves there.
+        **Arguments:** `path`: the states of a bridge, or of one branch of a tree. `points`: at the
+        first time, or, where `inverse`, at the last: then the way back, by solving each step for
+        the point that it moves there.
         """
         shapes, points, velocity_at = self._carrying(path, points)
         inverse = flag(inverse, "inverse")
@@ -213,12 +251,15 @@ class KunitaFlow(AbstractSDE):
         _, moved = lax.scan(step, points, (shapes[:-1], jnp.diff(shapes, axis=0)), reverse=inverse)
         moved = jnp.concatenate([moved, points[None]] if inverse else [points[None], moved])
         same = jnp.all(points[:, None] == shapes[-1 if inverse else 0][None], axis=-1)
-        return jnp.where(jnp.any(same, axis=1)[None, :, None], shapes[:, jnp.argmax(same, axis=1)], moved)
+        return jnp.where(
+            jnp.any(same, axis=1)[None, :, None], shapes[:, jnp.argmax(same, axis=1)], moved
+        )
 
     def jacobian(
         self, path: Float[Array, "K+1 n dim"], points: Float[Array, "q dim"]
     ) -> Float[Array, "K+1 q"]:
-        """By how much `carry` stretches the neighbourhood of points, the determinant of its derivative, at its times.
+        """By how much `carry` stretches the neighbourhood of points, the determinant of its
+        derivative, at its times.
 
         It is positive where steps are short enough for what is carried to be a diffeomorphism.
         """
@@ -233,7 +274,9 @@ class KunitaFlow(AbstractSDE):
         return jnp.concatenate([jnp.ones_like(stretched[:1]), jnp.cumprod(stretched, axis=0)])
 
     def _carrying(self, path, points) -> tuple[Array, Array, Callable[[Array, Array], Callable]]:
-        """The points of the path's shapes, the points to be carried, and the field that moves a shape like this."""
+        """The points of the path's shapes, the points to be carried, and the field that moves a
+        shape like this.
+        """
         path, points = as_float(path, "path"), as_float(points, "points")
         n, dim = self.space.size, self.space.dim
         require(
@@ -246,7 +289,11 @@ class KunitaFlow(AbstractSDE):
         )
         shapes = jax.vmap(self.space.to_points)(path)
         field = self.noise_field.chosen(shapes[0])
-        return shapes, points, lambda shape, moves: field.velocity(self.kernel, self.covariance_kernel, shape, moves)
+        return (
+            shapes,
+            points,
+            lambda shape, moves: field.velocity(self.kernel, self.covariance_kernel, shape, moves),
+        )
 
     def start(self, x: State) -> State:
         index = self.noise_field.factored_at(x)
@@ -258,7 +305,10 @@ class KunitaFlow(AbstractSDE):
 
     def check_state(self, x: State) -> None:
         shape = (self.space.size, self.space.dim)
-        require(x.shape == shape, f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}.")
+        require(
+            x.shape == shape,
+            f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}.",
+        )
         at_any_time(self.noise, x)
         index, value = self.noise_field.factored_at(x), concrete(x)
         index = None if index is None else concrete(index)
@@ -267,8 +317,9 @@ class KunitaFlow(AbstractSDE):
             i, j = np.unravel_index(np.argmin(gap), gap.shape)
             require(
                 gap[i, j] > _COINCIDE * np.ptp(value),
-                f"`x0` must have distinct landmarks; {index[min(i, j)]} and {index[max(i, j)]} coincide (distance "
-                f"{gap[i, j]:.1e}): they move as one point and their covariance is singular. Remove one of them, or "
+                f"`x0` must have distinct landmarks; {index[min(i, j)]} and {index[max(i, j)]} "
+                f"coincide (distance {gap[i, j]:.1e}): they move as one point and their "
+                "covariance is singular. Remove one of them, or "
                 'use `noise="spectral"`.',
             )
         self._check_room("x0", x, refuse=True)
@@ -288,8 +339,8 @@ class KunitaFlow(AbstractSDE):
             points = np.asarray(self.space.to_points(x))
             room = self.noise_field.room(self.kernel, self.covariance_kernel, points)
         message = (
-            f"`{name}` does not fit the noise, which is wrong there by {100 * lost:.0f} % of a(x, x): "
-            f"{room}."
+            f"`{name}` does not fit the noise, which is wrong there by {100 * lost:.0f} % of a(x, "
+            f"x): {room}."
         )
         require(not refuse or lost < _REFUSED, message)
         warnings.warn(message, stacklevel=3)

@@ -1,6 +1,7 @@
 """Linear SDEs, stepped by their exact law.
 
-    dX = (B X + β) dt + σ dW:   X_{t+τ} | X_t ~ N(e^{Bτ} X_t + ∫₀^τ e^{Bu} β du,  ∫₀^τ e^{Bu} σσᵀ e^{Bᵀu} du)
+dX = (B X + β) dt + σ dW:   X_{t+τ} | X_t ~ N(e^{Bτ} X_t + ∫₀^τ e^{Bu} β du,  ∫₀^τ e^{Bu} σσᵀ
+e^{Bᵀu} du)
 """
 
 from typing import ClassVar
@@ -24,9 +25,10 @@ class BrownianMotion(AbstractSDE):
 
     **Arguments:**
 
-    - `covariance`: Q, `()`, `(n,)` (a diagonal) or `(n, n)`, positive semi-definite: that of a smooth field on many
-      points is singular to the last digit, and is held by a factor of as many columns as it has directions. A traced
-      matrix must be definite, since its directions cannot be counted.
+    - `covariance`: Q, `()`, `(n,)` (a diagonal) or `(n, n)`, positive semi-definite: that of a
+      smooth field on many points is singular to the last digit, and is held by a factor of as many
+      columns as it has directions. A traced matrix must be definite, since its directions cannot be
+      counted.
     - `factor`: F `(n, m)` instead, with Q = F Fᵀ; also traced, and of any rank.
     - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
     """
@@ -43,11 +45,17 @@ class BrownianMotion(AbstractSDE):
         factor: ArrayLike | None = None,
         space: AbstractSpace | None = None,
     ):
-        require((covariance is None) != (factor is None), "Give `covariance` or `factor`, one of the two.")
+        require(
+            (covariance is None) != (factor is None),
+            "Give `covariance` or `factor`, one of the two.",
+        )
         if factor is not None:
             Q, F = None, as_float(factor, "factor")
             require_finite(F, "factor")
-            require(F.ndim == 2 and F.size > 0, f"`factor` must be a matrix (n, m); got shape {F.shape}.")
+            require(
+                F.ndim == 2 and F.size > 0,
+                f"`factor` must be a matrix (n, m); got shape {F.shape}.",
+            )
         else:
             Q = _as_symmetric(covariance, "covariance")
             F = _factor_of_singular(Q, "covariance")
@@ -96,7 +104,12 @@ class LinearSDE(AbstractSDE):
     has_exact_transition: ClassVar[bool] = True
 
     def __init__(
-        self, drift: ArrayLike, diffusion: ArrayLike, shift: ArrayLike = 0.0, *, space: AbstractSpace | None = None
+        self,
+        drift: ArrayLike,
+        diffusion: ArrayLike,
+        shift: ArrayLike = 0.0,
+        *,
+        space: AbstractSpace | None = None,
     ):
         self.drift_operator = as_float(drift, "drift")
         self.diffusion_operator = as_float(diffusion, "diffusion")
@@ -109,10 +122,15 @@ class LinearSDE(AbstractSDE):
             ("shift", self.shift),
         ):
             require_finite(value, name)
-            require(value.ndim <= 2, f"`{name}` must be a scalar, a vector or a matrix; got shape {value.shape}.")
+            require(
+                value.ndim <= 2,
+                f"`{name}` must be a scalar, a vector or a matrix; got shape {value.shape}.",
+            )
             require(value.size > 0, f"`{name}` must not be empty; got shape {value.shape}.")
         B = self.drift_operator
-        require(B.ndim < 2 or B.shape[0] == B.shape[1], f"`drift` must be square; got shape {B.shape}.")
+        require(
+            B.ndim < 2 or B.shape[0] == B.shape[1], f"`drift` must be square; got shape {B.shape}."
+        )
 
     def check_state(self, x: State) -> None:
         require_space(self.space, x)
@@ -123,12 +141,14 @@ class LinearSDE(AbstractSDE):
         ):
             require(
                 A.ndim == 0 or A.shape[0] == n,
-                f"`{name}` must be a scalar, a diagonal ({n},) or a matrix {full} for a state {x.shape}; got shape "
-                f"{A.shape}. A parameter with a batch axis does this too: vmap over it.",
+                f"`{name}` must be a scalar, a diagonal ({n},) or a matrix {full} for a state "
+                f"{x.shape}; got shape {A.shape}. A parameter with a batch axis does this too: "
+                "vmap over it.",
             )
         require(
             self.shift.shape in ((), (n,), x.shape),
-            f"`shift` must be a scalar, ({n},) or shaped like the state, {x.shape}; got shape {self.shift.shape}.",
+            f"`shift` must be a scalar, ({n},) or shaped like the state, {x.shape}; got shape "
+            f"{self.shift.shape}.",
         )
 
     def drift(self, t: RealScalar, x: State) -> State:
@@ -166,11 +186,14 @@ class LinearSDE(AbstractSDE):
     ) -> Transition:
         return self._displaced(self.drift(t0, origin)).transition(t0, t1, y)
 
-    def frame(self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar) -> Frame:
-        """Displacements from the noise-free path, moved so that it ends at `end`: they are as small as the noise.
+    def frame(
+        self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar
+    ) -> Frame:
+        """Displacements from the noise-free path, moved so that it ends at `end`: they are as small
+        as the noise.
 
-        From `end` itself where that is nearer to the start: the noise-free path of an unstable equation may be far
-        from where it is conditioned to go.
+        From `end` itself where that is nearer to the start: the noise-free path of an unstable
+        equation may be far from where it is conditioned to go.
         """
 
         none = jnp.zeros((), x0.dtype)
@@ -192,7 +215,9 @@ class LinearSDE(AbstractSDE):
     def linearised_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
         return self.exact_step(t0, t1, x)
 
-    def auxiliary_step(self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+    def auxiliary_step(
+        self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State
+    ) -> AffineStep:
         return auxiliary.linearised_step(t0, t1, x)
 
     def noise_size(self, x: State) -> int:
@@ -204,8 +229,8 @@ def as_covariance(value, name: str) -> Array:
     Q = _as_symmetric(value, name)
     require(
         _is_definite(concrete(Q)),
-        f"`{name}` must be positive definite; its Cholesky factorisation fails. Remove duplicated points, or add a "
-        "small multiple of the identity.",
+        f"`{name}` must be positive definite; its Cholesky factorisation fails. Remove duplicated "
+        "points, or add a small multiple of the identity.",
     )
     return Q
 
@@ -214,12 +239,13 @@ def _as_symmetric(value, name: str) -> Array:
     Q = as_float(value, name)
     require_finite(Q, name)
     require(
-        Q.ndim < 2 or (Q.ndim == 2 and Q.shape[0] == Q.shape[1]), f"`{name}` must be (), (n,) or (n, n); got {Q.shape}."
+        Q.ndim < 2 or (Q.ndim == 2 and Q.shape[0] == Q.shape[1]),
+        f"`{name}` must be (), (n,) or (n, n); got {Q.shape}.",
     )
     require(
         Q.ndim < 2 or concrete(Q) is None or jnp.allclose(Q, Q.T),
-        f"`{name}` must be symmetric; it differs from its transpose by {concrete(jnp.max(jnp.abs(Q - Q.T)))}. "
-        "Give the covariance, no factor of it.",
+        f"`{name}` must be symmetric; it differs from its transpose by "
+        f"{concrete(jnp.max(jnp.abs(Q - Q.T)))}. Give the covariance, no factor of it.",
     )
     return Q
 
@@ -235,7 +261,9 @@ def _is_definite(Q: np.ndarray | None) -> bool:
 
 
 def _factor_of_singular(Q: Array, name: str) -> Array | None:
-    """F with F Fᵀ = Q for a matrix that is known to have fewer directions than rows; `None` for any other."""
+    """F with F Fᵀ = Q for a matrix that is known to have fewer directions than rows; `None` for any
+    other.
+    """
     value = concrete(Q)
     if value is None or _is_definite(value):
         return None
@@ -244,7 +272,8 @@ def _factor_of_singular(Q: Array, name: str) -> Array | None:
     rounding = 10 * len(eigenvalues) * np.finfo(value.dtype).eps * largest
     require(
         largest > 0 and least >= -rounding,
-        f"`{name}` must be positive semi-definite, and not 0; its eigenvalues are from {least:.3g} to {largest:.3g}.",
+        f"`{name}` must be positive semi-definite, and not 0; its eigenvalues are from {least:.3g} "
+        f"to {largest:.3g}.",
     )
     if vectors is None:
         return None

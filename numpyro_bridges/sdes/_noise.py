@@ -1,8 +1,10 @@
-"""Representations of the noise of a Kunita flow: factors σ(x) of the covariance of a Gaussian field at given points.
+"""Representations of the noise of a Kunita flow: factors σ(x) of the covariance of a Gaussian field
+at given points.
 
-The field has covariance a(x, x'), the convolution of the flow's kernel with itself. Each representation gives σ with
-σσᵀ = a at the points: exactly (landmark), up to what some of the points do not tell of the others (control), up to a
-truncated tail and a wrap-around (spectral), up to a quadrature error (grid).
+The field has covariance a(x, x'), the convolution of the flow's kernel with itself. Each
+representation gives σ with σσᵀ = a at the points: exactly (landmark), up to what some of the points
+do not tell of the others (control), up to a truncated tail and a wrap-around (spectral), up to a
+quadrature error (grid).
 """
 
 import abc
@@ -33,7 +35,7 @@ from .._linalg import add, cholesky, safe_sqrt, solve_lower, varying_like
 from ..kernels import AbstractKernel
 
 _LOST = 0.5
-"""A wrong part of a(x, x) from which on noise is NaN; at the edge of a box half of a(x, x) is lost."""
+"""A wrong part of a(x, x) from which on noise is NaN; at the edge of a box half is lost."""
 
 MOST_CONTROLS = 64
 """Number of controls, unless it is given: up to here all landmarks are."""
@@ -43,20 +45,24 @@ class AbstractNoise(eqx.Module):
     """How the noise field of a Kunita flow is represented."""
 
     fixed_in_space: eqx.AbstractClassVar[bool]
-    """Fields fixed in space, whose variance a(x, x) is constant: Itô and Stratonovich readings coincide."""
+    """Fields fixed in space, whose variance a(x, x) is constant: Itô and Stratonovich readings
+    coincide.
+    """
 
     def chosen(self, points: Float[Array, "q d"]) -> "AbstractNoise":
         """For a flow that starts at these points."""
         return self
 
     def factored_at(self, points: Float[Array, "q d"]) -> Array | np.ndarray | None:
-        """Which points must be apart, since their covariance is factored; `None` if none of them."""
+        """Which points must be apart, since their covariance is factored; `None` if none."""
         return None
 
     def velocity(
         self, kernel, covariance, points: Float[Array, "q d"], moves: Float[Array, "q d"]
     ) -> Callable[[Float[Array, "s d"]], Float[Array, "s d"]]:
-        """The field that moves the points like this, anywhere: of those that do, that of least noise."""
+        """The field that moves the points like this, anywhere: of those that do, that of least
+        noise.
+        """
         u = jnp.linalg.lstsq(self.factor(kernel, covariance, points), moves)[0]
         return lambda others: self.factor(kernel, covariance, others) @ u
 
@@ -66,29 +72,38 @@ class AbstractNoise(eqx.Module):
     ) -> Float[Array, "q k"]:
         """σ at the points, one column per driving noise."""
 
-    def factor_and_covariance(self, kernel, covariance, points) -> tuple[Float[Array, "q k"], Float[Array, "q q"]]:
+    def factor_and_covariance(
+        self, kernel, covariance, points
+    ) -> tuple[Float[Array, "q k"], Float[Array, "q q"]]:
         """σ and σσᵀ at the points."""
         sigma = self.factor(kernel, covariance, points)
         return sigma, sigma @ sigma.T
 
     def misfit(self, kernel, covariance, points: Float[Array, "q d"]) -> Float[Array, ""]:
-        """By what part of a(x, x) the law at the points is wrong because they are too wide or too near an edge."""
+        """By what part of a(x, x) the law at the points is wrong because they are too wide or too
+        near an edge.
+        """
         return jnp.zeros((), points.dtype)
 
     def room(self, kernel, covariance, points: np.ndarray) -> str:
         """Where points must lie, in words and numbers, and the cure."""
         raise NotImplementedError
 
-    def error(self, kernel, covariance, dim: int, points: Float[Array, "s q d"] | None) -> dict[str, Array]:
-        """What the representation gets wrong, relative to a(x, x): at the worst of s states, or for any state."""
+    def error(
+        self, kernel, covariance, dim: int, points: Float[Array, "s q d"] | None
+    ) -> dict[str, Array]:
+        """What the representation gets wrong, relative to a(x, x): at the worst of s states, or for
+        any state.
+        """
         return {}
 
 
 class LandmarkNoise(AbstractNoise):
-    """Noise attached to the landmarks: the Cholesky factor of their covariance, n noises per coordinate.
+    """Noise attached to the landmarks: the Cholesky factor of their covariance, n noises per
+    coordinate.
 
-    **Arguments:** `jitter`: added to the diagonal, relative to a(x, x); by default 1e-5 in single and 1e-10 in double
-    precision, which keeps the factorisation of close landmarks finite.
+    **Arguments:** `jitter`: added to the diagonal, relative to a(x, x); by default 1e-5 in single
+    and 1e-10 in double precision, which keeps the factorisation of close landmarks finite.
     """
 
     jitter: Array | None
@@ -99,7 +114,8 @@ class LandmarkNoise(AbstractNoise):
         if self.jitter is not None:
             require(
                 self.jitter.ndim == 0 and jnp.isfinite(self.jitter) & (self.jitter >= 0),
-                f"`jitter` must be a number from 0 on, relative to the variance; got {jitter}. 1e-6 is large.",
+                f"`jitter` must be a number from 0 on, relative to the variance; got {jitter}. "
+                "1e-6 is large.",
             )
 
     def factored_at(self, points):
@@ -130,24 +146,26 @@ class LandmarkNoise(AbstractNoise):
 
 
 class ControlNoise(AbstractNoise):
-    """Noise of some of the landmarks, the controls c, that moves with the flow and carries the others,
+    """Noise of some of the landmarks, the controls c, that moves with the flow and carries the
+    others,
 
         σ(x) = a(x, c) a(c, c)^{-½},
 
-    m noises per coordinate, whatever the number of landmarks. It is exact where all landmarks are controls. Elsewhere
-    the field between controls is the mean that they tell, and lacks the variance a(x, x) − |σ(x)|²,
-    `flow.noise_error(x)`, which is small where they are nearer to each other than the length scale. It should be small
-    beside the errors of what is observed.
+    m noises per coordinate, whatever the number of landmarks. It is exact where all landmarks are
+    controls. Elsewhere the field between controls is the mean that they tell, and lacks the
+    variance a(x, x) − |σ(x)|², `flow.noise_error(x)`, which is small where they are nearer to each
+    other than the length scale. It should be small beside the errors of what is observed.
 
     **Arguments:**
 
     - `num_points`: m; by default 64, or all landmarks where they are fewer.
-    - `points`: `(m,)`, the indices of the controls. By default they are chosen from the start of a bridge, each as far
-      from those before it as can be. Give them where the start is a parameter, for they should not move with it.
+    - `points`: `(m,)`, the indices of the controls. By default they are chosen from the start of a
+      bridge, each as far from those before it as can be. Give them where the start is a parameter,
+      for they should not move with it.
     - `jitter`: as for `LandmarkNoise`.
 
-    `ControlNoise.within(tolerance, x, kernel)` finds how many are needed. An exact match can see no more rows than
-    there are controls.
+    `ControlNoise.within(tolerance, x, kernel)` finds how many are needed. An exact match can see no
+    more rows than there are controls.
     """
 
     num_points: int | None = eqx.field(static=True)
@@ -171,29 +189,40 @@ class ControlNoise(AbstractNoise):
         covariance: AbstractKernel | None = None,
         max_points: int = 512,
     ) -> "ControlNoise":
-        """As few controls of a shape as miss no more than a part `tolerance` of a(x, x) at any landmark.
+        """As few controls of a shape as miss no more than a part `tolerance` of a(x, x) at any
+        landmark.
 
-        **Arguments:** `kernel` or `covariance`: as of the flow, at the smallest length scale that is of interest.
+        **Arguments:** `kernel` or `covariance`: as of the flow, at the smallest length scale that
+        is of interest.
 
         **Errors:** `ValueError` where it takes more than `max_points`.
         """
         tolerance = known_number(tolerance, "tolerance", "between 0 and 1", lambda t: 0 < t < 1)
         shape = known_float(x, "x")
-        require(shape.ndim == 2 and shape.size, f"`x` must be a shape (n, dim); got shape {shape.shape}.")
-        require((kernel is None) != (covariance is None), "Give either `kernel` or `covariance`, as to the flow.")
+        require(
+            shape.ndim == 2 and shape.size,
+            f"`x` must be a shape (n, dim); got shape {shape.shape}.",
+        )
+        require(
+            (kernel is None) != (covariance is None),
+            "Give either `kernel` or `covariance`, as to the flow.",
+        )
         covariance = kernel.convolved(shape.shape[1]) if kernel is not None else covariance
         most = min(len(shape), positive_integer(max_points, "max_points"))
         order = np.asarray(farthest_points(jnp.asarray(shape), most))
 
         def missing(m: int) -> float:
             noise = cls(points=np.sort(order[:m]))
-            return float(noise.misfit(None, covariance, jnp.asarray(shape))) if m < len(shape) else 0.0
+            return (
+                float(noise.misfit(None, covariance, jnp.asarray(shape))) if m < len(shape) else 0.0
+            )
 
         least = missing(most)
         require(
             least <= tolerance,
-            f"`tolerance` must be within reach of {most} controls, which miss {least:.2g} of a(x, x); got {tolerance}. "
-            "Give a larger `max_points`, or a kernel with a longer length scale.",
+            f"`tolerance` must be within reach of {most} controls, which miss {least:.2g} of a(x, "
+            f"x); got {tolerance}. Give a larger `max_points`, or a kernel with a longer length "
+            "scale.",
         )
         m = bisect.bisect_left(range(1, most), True, key=lambda m: missing(m) <= tolerance) + 1
         return cls(points=np.sort(order[:m]))
@@ -204,11 +233,14 @@ class ControlNoise(AbstractNoise):
             last = -1 if known_points is None else int(known_points[-1])
             require(
                 last < len(points),
-                f"`points` of `ControlNoise` must be indices below {len(points)}; got {words(last)}.",
+                f"`points` of `ControlNoise` must be indices below {len(points)}; got "
+                f"{words(last)}.",
             )
             return self
         order = farthest_points(lax.stop_gradient(points), self._count(len(points)))
-        return eqx.tree_at(lambda noise: noise.points, self, jnp.sort(order), is_leaf=lambda leaf: leaf is None)
+        return eqx.tree_at(
+            lambda noise: noise.points, self, jnp.sort(order), is_leaf=lambda leaf: leaf is None
+        )
 
     def factored_at(self, points):
         index = self.chosen(points).points
@@ -217,7 +249,11 @@ class ControlNoise(AbstractNoise):
 
     def _count(self, n: int) -> int:
         m = min(n, MOST_CONTROLS) if self.num_points is None else self.num_points
-        require(m <= n, f"`num_points` of `ControlNoise` must be at most the number of landmarks, {n}; got {m}.")
+        require(
+            m <= n,
+            f"`num_points` of `ControlNoise` must be at most the number of landmarks, {n}; got "
+            f"{m}.",
+        )
         return m
 
     def factor(self, kernel, covariance, points):
@@ -228,14 +264,16 @@ class ControlNoise(AbstractNoise):
         """A factor of a(c, c), whether there is no noise at all, and a(c, x)."""
         index = self.factored_at(points)
         root, none, K = self.controls.factored(covariance, points[index])
-        across = covariance.matrix(points[index], points).at[:, index].set(K)  # the controls move as landmarks do
+        # the controls move as landmarks do
+        across = covariance.matrix(points[index], points).at[:, index].set(K)
         return root, none, across
 
     def _factor_and_missing(self, covariance, points) -> tuple[Array, Array]:
         """σ, and the part of a(x, x) that is missing at the worst point."""
         root, none, across = self._crossed(covariance, points)
         sigma = jnp.where(none, 0.0, solve_lower(root, across).T)
-        variance = covariance.variance.astype(sigma.dtype) + none.astype(sigma.dtype)  # 1 where there is none
+        # 1 where there is none
+        variance = covariance.variance.astype(sigma.dtype) + none.astype(sigma.dtype)
         told = jnp.min(jnp.sum(sigma**2, axis=1)) / variance
         return sigma, lax.select(none, jnp.zeros_like(told), jnp.maximum(1 - told, 0))
 
@@ -254,9 +292,9 @@ class ControlNoise(AbstractNoise):
     def room(self, kernel, covariance, points):
         m = self._count(len(points)) if self.points is None else len(self.points)
         return (
-            f"its {m} control landmarks are too far apart for the length scale of the covariance. Give "
-            "`ControlNoise(num_points)` more of them, or the points; `ControlNoise.within(tolerance, x, kernel)` finds "
-            "how many"
+            f"its {m} control landmarks are too far apart for the length scale of the covariance. "
+            "Give `ControlNoise(num_points)` more of them, or the points; "
+            "`ControlNoise.within(tolerance, x, kernel)` finds how many"
         )
 
     def error(self, kernel, covariance, dim, points):
@@ -264,7 +302,9 @@ class ControlNoise(AbstractNoise):
         if points is None:
             return {}
         chosen = self.chosen(points[0])
-        return {"missing": jnp.max(jax.vmap(lambda p: chosen.misfit(kernel, covariance, p))(points))}
+        return {
+            "missing": jnp.max(jax.vmap(lambda p: chosen.misfit(kernel, covariance, p))(points))
+        }
 
 
 def farthest_points(points: Float[Array, "n d"], m: int) -> Int[Array, " m"]:
@@ -286,9 +326,13 @@ def farthest_points(points: Float[Array, "n d"], m: int) -> Int[Array, " m"]:
 def _indices(points) -> Array:
     """Different rows of a shape, in increasing order."""
     value = known(points, "points")
-    require(value is not None, "`points` must be known when the program is traced; got a traced array.")
+    require(
+        value is not None, "`points` must be known when the program is traced; got a traced array."
+    )
     assert value is not None
-    good = value.ndim == 1 and value.size and np.all(value == np.round(value)) and np.all(value >= 0)
+    good = (
+        value.ndim == 1 and value.size and np.all(value == np.round(value)) and np.all(value >= 0)
+    )
     require(
         good and len(np.unique(value)) == len(value),
         f"`points` must be different indices of landmarks, (m,) from 0 on; got {words(points)}.",
@@ -297,18 +341,20 @@ def _indices(points) -> Array:
 
 
 class SpectralNoise(AbstractNoise):
-    """Random Fourier series on a torus of period P: over the lattice ω ∈ (2π/P) Z^d, one of each pair ±ω,
+    """Random Fourier series on a torus of period P: over the lattice ω ∈ (2π/P) Z^d, one of each
+    pair ±ω,
 
         σ_ω(x) = √(2 q̂(ω)/P^d) (cos ω·x, sin ω·x),      σ_0 = √(q̂(0)/P^d)
 
-    with q̂ the Fourier transform of the covariance. No factorisation; the noise does not depend on the number of points.
+    with q̂ the Fourier transform of the covariance. No factorisation; the noise does not depend on
+    the number of points.
 
     **Arguments:**
 
     - `num_modes`: largest frequency per axis; (2 num_modes + 1)^dim noises per coordinate.
-    - `period`: P, which must exceed the extent of the shapes along each axis: the wrap-around is a(P − extent). By
-      default `diameter + 8.6 length_scale` for the Gaussian kernel's length scale (wrap-around 1e-8). Where the
-      wrap-around exceeds half of a(x, x) the noise is NaN.
+    - `period`: P, which must exceed the extent of the shapes along each axis: the wrap-around is
+      a(P − extent). By default `diameter + 8.6 length_scale` for the Gaussian kernel's length scale
+      (wrap-around 1e-8). Where the wrap-around exceeds half of a(x, x) the noise is NaN.
     - `diameter`: of the shapes that the flow may reach, used by the default period.
     """
 
@@ -321,18 +367,30 @@ class SpectralNoise(AbstractNoise):
         self.num_modes = positive_integer(num_modes, "num_modes")
         self.period = None if period is None else as_float(period, "period")
         self.diameter = as_float(diameter, "diameter")
-        require_positive(self.diameter, "diameter", "Give the largest distance of two points that is expected.")
-        require(self.diameter.ndim == 0, f"`diameter` must be one number; got shape {self.diameter.shape}.")
+        require_positive(
+            self.diameter, "diameter", "Give the largest distance of two points that is expected."
+        )
+        require(
+            self.diameter.ndim == 0,
+            f"`diameter` must be one number; got shape {self.diameter.shape}.",
+        )
         if self.period is not None:
-            require_positive(self.period, "period", "Give the side of a box that the shapes stay well inside.")
-            require(self.period.ndim == 0, f"`period` must be one number for all axes; got shape {self.period.shape}.")
+            require_positive(
+                self.period, "period", "Give the side of a box that the shapes stay well inside."
+            )
+            require(
+                self.period.ndim == 0,
+                f"`period` must be one number for all axes; got shape {self.period.shape}.",
+            )
 
     def _period(self, kernel, covariance):
         if self.period is not None:
             return self.period
         known = covariance if kernel is None else kernel
         if not hasattr(known, "length_scale"):
-            raise ValueError("`period` must be given to SpectralNoise: this kernel has no single length scale.")
+            raise ValueError(
+                "`period` must be given to SpectralNoise: this kernel has no single length scale."
+            )
         length_scale = known.length_scale / jnp.sqrt(2.0) if kernel is None else known.length_scale
         return self.diameter + 8.6 * length_scale
 
@@ -353,7 +411,9 @@ class SpectralNoise(AbstractNoise):
         scale = safe_sqrt(covariance.spectral_density(omega, dim) / period**dim)  # it underflows
         scale = jnp.concatenate([scale[:1], jnp.sqrt(2.0) * scale[1:]])
         phase = points @ omega.T
-        return jnp.concatenate([scale[None] * jnp.cos(phase), (scale[None] * jnp.sin(phase))[:, 1:]], axis=1)
+        return jnp.concatenate(
+            [scale[None] * jnp.cos(phase), (scale[None] * jnp.sin(phase))[:, 1:]], axis=1
+        )
 
     def misfit(self, kernel, covariance, points):
         extent = jnp.max(jnp.max(points, axis=0) - jnp.min(points, axis=0))
@@ -363,10 +423,10 @@ class SpectralNoise(AbstractNoise):
         extent = np.max(np.ptp(points, axis=0))
         period = self._period(kernel, covariance)
         return (
-            f"its extent along an axis, {extent:.4g}, must stay below the `period` of `SpectralNoise`, {period:.4g}, "
-            "by several length scales of the covariance. Give "
-            f"`SpectralNoise(num_modes, diameter={1.5 * extent:.2g})` with more modes in proportion and without a "
-            "`period`, or scale the shapes"
+            f"its extent along an axis, {extent:.4g}, must stay below the `period` of "
+            f"`SpectralNoise`, {period:.4g}, by several length scales of the covariance. Give "
+            f"`SpectralNoise(num_modes, diameter={1.5 * extent:.2g})` with more modes in "
+            "proportion and without a `period`, or scale the shapes"
         )
 
     def _wrap_around(self, kernel, covariance, dim: int, extent) -> Array:
@@ -376,11 +436,13 @@ class SpectralNoise(AbstractNoise):
         ends = gap * np.eye(2, dim, k=-1, dtype=gap.dtype)
         values = covariance.matrix(ends[:1], ends)[0]
         none = values[0] == 0  # an amplitude that underflows
-        return lax.select(none, jnp.zeros_like(values[1]), values[1] / jnp.where(none, 1.0, values[0]))
+        return lax.select(
+            none, jnp.zeros_like(values[1]), values[1] / jnp.where(none, 1.0, values[0])
+        )
 
     def error(self, kernel, covariance, dim, points):
-        """The truncated `tail` (variance missing at a point), and the `wrap_around`, at the given diameter or for the
-        states."""
+        """The truncated `tail` (variance missing at a point), and the `wrap_around`, at the given
+        diameter or for the states."""
         origin = jnp.zeros((1, dim))
         variance = covariance.matrix(origin, origin)[0, 0]
         factor = self._series(kernel, covariance, origin)
@@ -394,10 +456,11 @@ class SpectralNoise(AbstractNoise):
 class GridNoise(AbstractNoise):
     """Quadrature of ∫ k(x, y) dW(y) on the cells of a box, σ_y(x) = k(x, y) √|cell|.
 
-    The weight is the square root of the cell's volume: without it the noise grows as the grid is refined.
-    Right for points at least about three length scales inside the box; NaN outside of it.
+    The weight is the square root of the cell's volume: without it the noise grows as the grid is
+    refined. Right for points at least about three length scales inside the box; NaN outside of it.
 
-    **Arguments:** `lower`, `upper`: corners of the box, scalars or `(dim,)`; `num_cells`: cells per axis.
+    **Arguments:** `lower`, `upper`: corners of the box, scalars or `(dim,)`; `num_cells`: cells per
+    axis.
     """
 
     lower: Array
@@ -412,31 +475,41 @@ class GridNoise(AbstractNoise):
         shapes = {self.lower.shape, self.upper.shape} - {()}
         require(
             len(shapes) < 2 and all(len(shape) == 1 for shape in shapes),
-            f"`lower` and `upper` must be numbers or corners (dim,) of a box; got shapes {self.lower.shape} and "
-            f"{self.upper.shape}.",
+            "`lower` and `upper` must be numbers or corners (dim,) of a box; got shapes "
+            f"{self.lower.shape} and {self.upper.shape}.",
         )
-        require(jnp.all(self.lower < self.upper), f"`lower` must be below `upper`; got {lower} and {upper}.")
+        require(
+            jnp.all(self.lower < self.upper),
+            f"`lower` must be below `upper`; got {lower} and {upper}.",
+        )
         self.num_cells = positive_integer(num_cells, "num_cells")
 
     def factor(self, kernel, covariance, points):
         sigma = self._quadrature(kernel, points, self.num_cells)
-        inside = jnp.all((points >= self.lower.astype(points.dtype)) & (points <= self.upper.astype(points.dtype)))
+        inside = jnp.all(
+            (points >= self.lower.astype(points.dtype))
+            & (points <= self.upper.astype(points.dtype))
+        )
         return jnp.where(inside, sigma, jnp.nan)
 
     def _quadrature(self, kernel, points, num_cells: int):
         if kernel is None:
             raise ValueError(
-                '`noise="grid"` needs the flow\'s `kernel`; with `covariance=` use "landmark" or "spectral".'
+                '`noise="grid"` needs the flow\'s `kernel`; with `covariance=` use '
+                '"landmark" or "spectral".'
             )
         dim = points.shape[1]
         corners = {self.lower.shape, self.upper.shape}
         require(
             corners <= {(), (dim,)},
-            f"`lower` and `upper` must be numbers or corners ({dim},) of a box; got shapes {sorted(corners)}.",
+            f"`lower` and `upper` must be numbers or corners ({dim},) of a box; got shapes "
+            f"{sorted(corners)}.",
         )
         width = jnp.broadcast_to((self.upper - self.lower) / num_cells, (dim,))
         index = np.array(list(itertools.product(range(num_cells), repeat=dim)), float) + 0.5
-        cells = jnp.broadcast_to(self.lower, (1, dim)) + jnp.asarray(index, points.dtype) * width[None]
+        cells = (
+            jnp.broadcast_to(self.lower, (1, dim)) + jnp.asarray(index, points.dtype) * width[None]
+        )
         return kernel.matrix(points, cells) * jnp.sqrt(jnp.prod(width))
 
     def misfit(self, kernel, covariance, points):
@@ -448,14 +521,15 @@ class GridNoise(AbstractNoise):
         corners = [np.array2string(np.asarray(c), precision=4) for c in (self.lower, self.upper)]
         low, high = (np.array2string(f(points, axis=0), precision=4) for f in (np.min, np.max))
         return (
-            f"its points, from {low} to {high}, must lie about three length scales inside the box of `GridNoise`, from "
-            f"{corners[0]} to {corners[1]}. Give `GridNoise(lower, upper, num_cells)` a larger one, with cells no "
-            "wider than the length scale, or move and scale the shapes"
+            f"its points, from {low} to {high}, must lie about three length scales inside the box "
+            f"of `GridNoise`, from {corners[0]} to {corners[1]}. Give `GridNoise(lower, upper, "
+            "num_cells)` a larger one, with cells no wider than the length scale, or move and "
+            "scale the shapes"
         )
 
     def error(self, kernel, covariance, dim, points):
-        """At the points of the states: the variance lost at the `edge` of the box, and the whole error of the
-        `quadrature` of a(x, x)."""
+        """At the points of the states: the variance lost at the `edge` of the box, and the whole
+        error of the `quadrature` of a(x, x)."""
         if points is None:
             return {}
         points = points.reshape(-1, dim)
@@ -474,5 +548,7 @@ NOISES: dict[str, Callable[[], AbstractNoise]] = {
 
 def name_of(noise: AbstractNoise) -> str:
     """By which `KunitaFlow` knows it."""
-    (name,) = [name for name, kind in NOISES.items() if kind is type(noise)] or [type(noise).__name__]
+    (name,) = [name for name, kind in NOISES.items() if kind is type(noise)] or [
+        type(noise).__name__
+    ]
     return name

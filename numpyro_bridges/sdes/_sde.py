@@ -30,25 +30,30 @@ class _Static(eqx.Module):
 
 
 def wrapped(f: Callable) -> Any:
-    """A function as a part of a module: a pytree keeps its leaves, a plain function becomes static."""
+    """A function as part of a module: a pytree keeps its leaves, a plain function is static."""
     return _Static(f) if jax.tree_util.all_leaves((f,)) else f
 
 
 @contextmanager
 def _no_escape(name: str):
-    """Says in words what JAX finds: a function that captured a value of a traced program which has ended."""
+    """Says in words what JAX finds: a function that captured a value of a traced program which has
+    ended.
+    """
     try:
         yield
     except jax.errors.UnexpectedTracerError as e:
         raise ValueError(
-            f"`{name}` captured a value of a traced program that has ended: `jax.vmap`, `jax.jit` or `jax.grad` made "
-            "this SDE from a function that closes over a parameter. Put the parameter into `args`, which "
-            "f(t, x, args) is given, or make it a leaf of an `equinox.Module` that is the function."
+            f"`{name}` captured a value of a traced program that has ended: `jax.vmap`, `jax.jit` "
+            "or `jax.grad` made this SDE from a function that closes over a parameter. Put the "
+            "parameter into `args`, which f(t, x, args) is given, or make it a leaf of an "
+            "`equinox.Module` that is the function."
         ) from e
 
 
 class _Coefficient(eqx.Module):
-    """Calls a user's function, or the one of its own where that is a plain one; an array in the state's precision."""
+    """Calls a user's function, or the one of its own where that is a plain one; an array in the
+    state's precision.
+    """
 
     name: str = eqx.field(static=True)
     own: _Static | None
@@ -64,7 +69,9 @@ class _Coefficient(eqx.Module):
 
 
 class AbstractFunctionSDE(AbstractSDE):
-    """An SDE two of whose coefficients are a user's functions f(t, x, args): `diffusion`, and one that pulls."""
+    """An SDE two of whose coefficients are a user's functions f(t, x, args): `diffusion`, and one
+    that pulls.
+    """
 
     diffusion_function: Any
     args: Any
@@ -77,11 +84,13 @@ class AbstractFunctionSDE(AbstractSDE):
         for name, f in ((self.pull, pull), ("diffusion", diffusion)):
             if not callable(f):
                 raise ValueError(
-                    f"`{name}` must be a function f(t, x, args); got {f!r}. Wrap it: `lambda t, x, args: ...`."
+                    f"`{name}` must be a function f(t, x, args); got {f!r}. Wrap it: `lambda t, x, "
+                    "args: ...`."
                 )
             require(
                 _takes_three(f),
-                f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add those it does without.",
+                f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add "
+                "those it does without.",
             )
         setattr(self, f"{self.pull}_function", wrapped(pull))
         self.diffusion_function = wrapped(diffusion)
@@ -116,7 +125,8 @@ class AbstractFunctionSDE(AbstractSDE):
         sigma = diffusion(self.diffusion_function, t, x, self.args)
         require(
             sigma.ndim <= 2,
-            f"`diffusion` must return a scalar, a diagonal (n,) or a matrix (n, k); got shape {sigma.shape}.",
+            "`diffusion` must return a scalar, a diagonal (n,) or a matrix (n, k); got shape "
+            f"{sigma.shape}.",
         )
         return sigma, compose(sigma, transpose(sigma))
 
@@ -130,20 +140,29 @@ class SDE(AbstractFunctionSDE):
     **Arguments:**
 
     - `drift`: `f(t, x, args)`, shaped like x, for t in [t0, t1].
-    - `diffusion`: `f(t, x, args)`: a scalar, a diagonal `(n,)`, a matrix `(n, k)` or a lineax operator. It acts on the
-      first axis of the state; k may be smaller (hypo-elliptic) or larger than n.
-    - `args`: the parameters, a pytree of arrays. Anything a prior is put on belongs here, or is a leaf of an
-      `equinox.Module` passed as `drift` or `diffusion`.
+    - `diffusion`: `f(t, x, args)`: a scalar, a diagonal `(n,)`, a matrix `(n, k)` or a lineax
+      operator. It acts on the first axis of the state; k may be smaller (hypo-elliptic) or larger
+      than n.
+    - `args`: the parameters, a pytree of arrays. Anything a prior is put on belongs here, or is a
+      leaf of an `equinox.Module` passed as `drift` or `diffusion`.
     - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
 
-    Bridges and laws hold what the functions are at the moment when they are made: attributes, globals and closures
-    that the functions read are frozen then, and captured arrays, traced ones too, are differentiated through.
+    Bridges and laws hold what the functions are at the moment when they are made: attributes,
+    globals and closures that the functions read are frozen then, and captured arrays, traced ones
+    too, are differentiated through.
     """
 
     drift_function: Any
     pull: ClassVar[str] = "drift"
 
-    def __init__(self, drift: Callable, diffusion: Callable, args: Any = None, *, space: AbstractSpace | None = None):
+    def __init__(
+        self,
+        drift: Callable,
+        diffusion: Callable,
+        args: Any = None,
+        *,
+        space: AbstractSpace | None = None,
+    ):
         super().__init__(drift, diffusion, args, space)
 
     def drift(self, t: RealScalar, x: State) -> State:
@@ -156,7 +175,8 @@ def _parameter(leaf: Any) -> jax.Array:
         return jnp.asarray(leaf)
     except TypeError as e:
         raise ValueError(
-            f"`args` must hold numbers and arrays, the parameters; got {leaf!r}. Let the function itself hold the rest."
+            f"`args` must hold numbers and arrays, the parameters; got {leaf!r}. Let the function "
+            "itself hold the rest."
         ) from e
 
 

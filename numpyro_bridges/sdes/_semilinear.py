@@ -1,4 +1,6 @@
-"""Semilinear SDEs: a linear operator that generates a semigroup, and what is not linear held over a step."""
+"""Semilinear SDEs: a linear operator that generates a semigroup, and what is not linear held over a
+step.
+"""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -18,32 +20,38 @@ from ._exponential import affine_step, exponential_noise_size, exponential_trans
 from ._sde import AbstractFunctionSDE
 
 _MAX_LINEARISED = 64
-"""Largest state, n · dim numbers, of which the nonlinearity has its full Jacobian; beyond, its diagonal."""
+"""Largest state, n · dim numbers, of which the nonlinearity has its full Jacobian; beyond, its
+diagonal.
+"""
 
 
 class SemilinearSDE(AbstractFunctionSDE):
     """dX = (A X + F(t, X)) dt + B(t, X) dW, stepped by exponential Euler.
 
-    x' = e^{A dt} x + ∫₀^dt e^{Au} du F(t, x) + N(0, ∫₀^dt e^{Au} B Bᵀ e^{Aᵀu} du), F and B held at the start of a step:
-    the exact law where F = 0 and B is constant, and stable however fast the modes of A decay, where a step of
-    Euler–Maruyama must be short beside the fastest. For a reaction–diffusion equation A is ν Δ,
+    x' = e^{A dt} x + ∫₀^dt e^{Au} du F(t, x) + N(0, ∫₀^dt e^{Au} B Bᵀ e^{Aᵀu} du), F and B held at
+    the start of a step: the exact law where F = 0 and B is constant, and stable however fast the
+    modes of A decay, where a step of Euler–Maruyama must be short beside the fastest. For a
+    reaction–diffusion equation A is ν Δ,
 
-        space = FourierBasis(32, 1)
-        SemilinearSDE(0.1 * space.laplacian, lambda t, x, args: space.from_points(f(space.to_points(x))), sigma)
+        space = FourierBasis(32, 1) SemilinearSDE(0.1 * space.laplacian, lambda t, x, args:
+        space.from_points(f(space.to_points(x))), sigma)
 
     **Arguments:**
 
     - `linear`: A, `()`, `(n,)` where it is diagonal in the basis of the states, or `(n, n)`.
     - `nonlinearity`: F, `f(t, x, args)`, shaped like x, for t in [t0, t1].
-    - `diffusion`: B, an array, `()`, `(n,)` or `(n, k)`, or a function `f(t, x, args)` that returns one.
+    - `diffusion`: B, an array, `()`, `(n,)` or `(n, k)`, or a function `f(t, x, args)` that returns
+      one.
     - `args`: the parameters of the functions, a pytree of arrays, as for `SDE`.
     - `space`: where states live, for the H-norm of conditions; Euclidean if not given.
-    - `scheme`: `"euler"`, or `"midpoint"`, which takes F and B where half a step without noise leads, and stretches the
-      noise of the step by e^{½ dt F'}, F' its diagonal (beyond 64 numbers one for all, by one product with F'). For
-      B that does not depend on x what is left of the error is of second order where F is linear and diagonal, and
-      smaller than Euler's elsewhere; a step costs two to three times as much.
+    - `scheme`: `"euler"`, or `"midpoint"`, which takes F and B where half a step without noise
+      leads, and stretches the noise of the step by e^{½ dt F'}, F' its diagonal (beyond 64 numbers
+      one for all, by one product with F'). For B that does not depend on x what is left of the
+      error is of second order where F is linear and diagonal, and smaller than Euler's elsewhere; a
+      step costs two to three times as much.
 
-    Lord, Powell and Shardlow (2014), An Introduction to Computational Stochastic PDEs, section 10.8.
+    Lord, Powell and Shardlow (2014), An Introduction to Computational Stochastic PDEs, section
+    10.8.
     """
 
     linear: Structured
@@ -66,8 +74,9 @@ class SemilinearSDE(AbstractFunctionSDE):
         shape = self.linear.shape
         require(
             len(shape) < 2 or shape == shape[:1] * 2,
-            f"`linear` must be a scalar, a diagonal (n,) or a square matrix (n, n); got shape {shape}. An operator "
-            "that the basis does not diagonalise is given as its matrix in the basis.",
+            "`linear` must be a scalar, a diagonal (n,) or a square matrix (n, n); got shape "
+            f"{shape}. An operator that the basis does not diagonalise is given as its matrix in "
+            "the basis.",
         )
         require_finite(self.linear, "linear")
         if not callable(diffusion):
@@ -97,7 +106,9 @@ class SemilinearSDE(AbstractFunctionSDE):
         return Transition(x, step.increment, factor, congruence(stretch, step.covariance))
 
     def _mean_slope(self, t: RealScalar, x: State) -> Structured:
-        """The diagonal of F', or of large states its mean, nearly: vᵀ F' v / n for one v of random signs."""
+        """The diagonal of F', or of large states its mean, nearly: vᵀ F' v / n for one v of random
+        signs.
+        """
         if x.size <= _MAX_LINEARISED:
             return self._diagonal_slope(t, x)
         signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], x.shape), x.dtype)
@@ -105,7 +116,9 @@ class SemilinearSDE(AbstractFunctionSDE):
         return jnp.sum(signs * along) / x.size
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
-        """A + F'(x) and β; of F' its diagonal for states of more than 64 numbers, so that a diagonal A stays one."""
+        """A + F'(x) and β; of F' its diagonal for states of more than 64 numbers, so that a
+        diagonal A stays one.
+        """
         slope, beta = self._linearised(t, x)
         return add(self._generator(x), slope), beta
 
@@ -113,7 +126,9 @@ class SemilinearSDE(AbstractFunctionSDE):
         slope, beta = self._linearised(t0, x)
         return affine_step(self._generator(x), slope, beta, self.covariance(t0, x), t1 - t0)
 
-    def auxiliary_step(self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+    def auxiliary_step(
+        self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State
+    ) -> AffineStep:
         B, beta = auxiliary.linearised_drift(t0, x)
         A = self._generator(x)
         return affine_step(A, add(B, -A), beta, auxiliary.covariance(t0, x), t1 - t0)
@@ -125,19 +140,22 @@ class SemilinearSDE(AbstractFunctionSDE):
         n = x.shape[0]
         require(
             self.linear.ndim == 0 or self.linear.shape[0] == n,
-            f"`linear` must be a scalar, a diagonal ({n},) or a matrix ({n}, {n}) for a state {x.shape}; got shape "
-            f"{self.linear.shape}. A parameter with a batch axis does this too: vmap over it.",
+            f"`linear` must be a scalar, a diagonal ({n},) or a matrix ({n}, {n}) for a state "
+            f"{x.shape}; got shape {self.linear.shape}. A parameter with a batch axis does this "
+            "too: vmap over it.",
         )
         pulled = at_any_time(self.pulled, x)
         require(
             pulled.shape == x.shape,
-            f"`nonlinearity` must return an array shaped like the state, {x.shape}; got {pulled.shape}. "
-            "A parameter with a batch axis does this too: vmap over it.",
+            f"`nonlinearity` must return an array shaped like the state, {x.shape}; got "
+            f"{pulled.shape}. A parameter with a batch axis does this too: vmap over it.",
         )
         super().check_state(x)
 
     def _linearised(self, t: RealScalar, x: State) -> tuple[Structured, State]:
-        """F' and β with F(t, y) ≈ F' y + β near x; F' acts on the first axis, its mean over columns."""
+        """F' and β with F(t, y) ≈ F' y + β near x; F' acts on the first axis, its mean over
+        columns.
+        """
         value = self.pulled(t, x)
         if x.size <= _MAX_LINEARISED:
             jacobian = jax.jacfwd(self.pulled, argnums=1)(t, x)
@@ -151,7 +169,9 @@ class SemilinearSDE(AbstractFunctionSDE):
         _, along = jax.linearize(lambda y: self.pulled(t, y), x)
 
         def entry(direction):
-            return along(jnp.zeros_like(x).reshape(-1).at[direction].set(1.0).reshape(x.shape)).reshape(-1)[direction]
+            return along(
+                jnp.zeros_like(x).reshape(-1).at[direction].set(1.0).reshape(x.shape)
+            ).reshape(-1)[direction]
 
         entries = jax.lax.map(entry, jnp.arange(x.size), batch_size=_MAX_LINEARISED)
         return jnp.mean(entries.reshape(x.shape[0], -1), axis=1)

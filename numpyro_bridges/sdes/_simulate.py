@@ -34,7 +34,8 @@ def simulate(sde: AbstractSDE, x0: ArrayLike, ts: ArrayLike, noise: ArrayLike) -
     allowed = (shape, shape[:2]) if x0.ndim == 1 else (shape,)
     require(
         jnp.shape(noise) in allowed,
-        f"`noise` must have shape {shape}, one row per step; got {jnp.shape(noise)}. Use vmap for a batch.",
+        f"`noise` must have shape {shape}, one row per step; got {jnp.shape(noise)}. Use vmap for "
+        "a batch.",
     )
     displaced = Displaced(sde, x0, grid.clock(sde, x0).astype(x0.dtype))
 
@@ -50,7 +51,8 @@ def simulate(sde: AbstractSDE, x0: ArrayLike, ts: ArrayLike, noise: ArrayLike) -
 
 
 def law_of_end(sde: AbstractSDE, x0: State, ts) -> tuple[State, Structured]:
-    """Mean and covariance `(n, n)` of the end state, the SDE linearised along its path without noise.
+    """Mean and covariance `(n, n)` of the end state, the SDE linearised along its path without
+    noise.
 
     **Arguments:** `ts` `(K + 1,)`: times as the SDE sees them.
     """

@@ -1,6 +1,8 @@
-"""What a space is: a finite set of functions on a domain, and the norm in which curves and fields are compared.
+"""What a space is: a finite set of functions on a domain, and the norm in which curves and fields
+are compared.
 
-A function s ↦ x(s) in R^dim, such as a closed curve with s in [0, 2π), is held as a state of n rows x_i in R^dim,
+A function s ↦ x(s) in R^dim, such as a closed curve with s in [0, 2π), is held as a state of n rows
+x_i in R^dim,
 
     x(s) = Σ_i φ_i(s) x_i,    ‖x‖² = Σ_i w_i |x_i|² ≈ ∫ |x(s)|² ds / ∫ ds      (the H-norm).
 """
@@ -17,7 +19,8 @@ from .._linalg import as_columns, rows, safe_sqrt
 
 
 class AbstractSpace(eqx.Module):
-    """Functions with values in R^dim, discretised. Everything is written for one state, (size, dim).
+    """Functions with values in R^dim, discretised. Everything is written for one state, (size,
+    dim).
 
     A state of values in R may be a vector, (size,), and then so are its points.
     """
@@ -37,7 +40,9 @@ class AbstractSpace(eqx.Module):
 
     @abstractmethod
     def parameters(self, count: int) -> np.ndarray:
-        """So many parameters, evenly spread over the domain: those of points that are given without."""
+        """So many parameters, evenly spread over the domain: those of points that are given
+        without.
+        """
 
     @abstractmethod
     def basis(self, s: ArrayLike) -> Float[Array, "m n"]:
@@ -56,8 +61,8 @@ class AbstractSpace(eqx.Module):
         x, y = self._state(x), self._state(y, "y")
         require(
             jnp.ndim(self.weights) == 1,
-            f"`weights` must be of shape ({self.size},); got {jnp.shape(self.weights)}. For a batch of "
-            "spaces, `jax.vmap` the function that uses them.",
+            f"`weights` must be of shape ({self.size},); got {jnp.shape(self.weights)}. For a "
+            "batch of spaces, `jax.vmap` the function that uses them.",
         )
         return jnp.sum(rows(self.weights.astype(x.dtype), x) * x * y)
 
@@ -74,29 +79,36 @@ class AbstractSpace(eqx.Module):
         x = self._state(x)
         return jnp.matmul(self.basis(s).astype(x.dtype), x, precision="highest")
 
-    def project(self, values: Float[Array, "m *dim"], s: ArrayLike | None = None) -> Float[Array, "n *dim"]:
+    def project(
+        self, values: Float[Array, "m *dim"], s: ArrayLike | None = None
+    ) -> Float[Array, "n *dim"]:
         """The curve of this space that is nearest to given points, by least squares.
 
         **Arguments:**
 
-        - `values`: points of a curve, (m, dim), at least as many as a state has rows. (The curve through
+        - `values`: points of a curve, (m, dim), at least as many as a state has rows. (The curve
+          through
             fewer landmarks is `refine` from their own space.)
         - `s`: their parameters, (m,); `parameters(m)` if left out, for curves equispaced from 0 on.
 
-        **Returns:** the state; where the points leave it open (repeated parameters), the one of least norm.
+        **Returns:** the state; where the points leave it open (repeated parameters), the one of
+        least norm.
         """
         values = floating(values, "values")
         require(
             self._fits(values.shape[1:]) and values.shape[0] >= self.size,
-            f"`values` must be at least {self.size} points of dimension {self.dim}, one a row; got shape "
-            f"{values.shape}. Fewer points become a curve by `refine` from `Landmarks` of their number; "
-            "for a batch, use `jax.vmap`.",
+            f"`values` must be at least {self.size} points of dimension {self.dim}, one a row; "
+            f"got shape {values.shape}. Fewer points become a curve by `refine` from `Landmarks` "
+            "of their number; for a batch, use `jax.vmap`.",
         )
-        require_finite(values, "values", "Missing points are left out, with `s` for those that are there.")
+        require_finite(
+            values, "values", "Missing points are left out, with `s` for those that are there."
+        )
         basis = self.basis(self.parameters(values.shape[0]) if s is None else s)
         require(
             basis.shape[0] == values.shape[0],
-            f"`s` must have one parameter for each of {values.shape[0]} points; got shape {basis.shape[:1]}.",
+            f"`s` must have one parameter for each of {values.shape[0]} points; got shape "
+            f"{basis.shape[:1]}.",
         )
         found = jnp.linalg.lstsq(basis.astype(values.dtype), as_columns(values))[0]
         return found.reshape(self.size, *values.shape[1:])
@@ -104,9 +116,12 @@ class AbstractSpace(eqx.Module):
     def refine(self, x: Float[Array, "n *dim"], finer: "AbstractSpace") -> Float[Array, "m *dim"]:
         """The same curve as a state of another space that is at least as fine, of either kind.
 
-        A coarser space gets what its `from_points` makes of the curve: its points, or projected coefficients.
+        A coarser space gets what its `from_points` makes of the curve: its points, or projected
+        coefficients.
         """
-        require_instance(finer, AbstractSpace, "finer", "a space, such as `FourierBasis(num_modes, dim)`")
+        require_instance(
+            finer, AbstractSpace, "finer", "a space, such as `FourierBasis(num_modes, dim)`"
+        )
         require(
             finer.dim == self.dim,
             f"`finer` must hold curves in R^{self.dim}; got a space of dimension {finer.dim}.",
@@ -118,8 +133,8 @@ class AbstractSpace(eqx.Module):
         x = floating(x, name)
         require(
             x.shape[:1] == (self.size,) and self._fits(x.shape[1:]),
-            f"`{name}`, a state of this space, must have shape ({self.size}, {self.dim}); got {x.shape}. "
-            "For a batch, use `jax.vmap`.",
+            f"`{name}`, a state of this space, must have shape ({self.size}, {self.dim}); got "
+            f"{x.shape}. For a batch, use `jax.vmap`.",
         )
         return x
 

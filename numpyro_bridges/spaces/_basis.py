@@ -17,7 +17,8 @@ from ._base import AbstractSpace, equispaced
 def waves(s: ArrayLike, frequencies: np.ndarray, ndim: int = 1) -> tuple[Any, Any, Any]:
     """cos k s and sin k s, `(..., frequencies)`, and s.
 
-    In NumPy and double precision unless s is traced: single precision loses digits in cos ks for a large k.
+    In NumPy and double precision unless s is traced: single precision loses digits in cos ks for a
+    large k.
     """
     converted = floating(s, "s")
     traced = isinstance(converted, Tracer)
@@ -42,8 +43,9 @@ def fourier_functions(s: ArrayLike, num_modes: int, ndim: int = 1) -> Any:
 class AbstractBasis(AbstractSpace):
     """Functions by n coefficients in a basis that is orthonormal in L² of a domain of mass 1.
 
-    The H-norm is the Euclidean norm of the coefficients. Fields are evaluated at q points of the domain, `grid`: with Φ
-    the (q, n) values of the basis there, points are Φ x and the coefficients of a field f are Φᵀ f / q, Φᵀ Φ / q = I.
+    The H-norm is the Euclidean norm of the coefficients. Fields are evaluated at q points of the
+    domain, `grid`: with Φ the (q, n) values of the basis there, points are Φ x and the coefficients
+    of a field f are Φᵀ f / q, Φᵀ Φ / q = I.
     """
 
     num_quadrature: eqx.AbstractVar[int]
@@ -51,7 +53,9 @@ class AbstractBasis(AbstractSpace):
     @property
     @abstractmethod
     def laplacian(self) -> Float[Array, " n"]:
-        """The eigenvalues of the Laplacian, none of them positive: ν Δ is the diagonal `ν * space.laplacian`."""
+        """The eigenvalues of the Laplacian, none of them positive: ν Δ is the diagonal `ν *
+        space.laplacian`.
+        """
 
     @abstractmethod
     def functions(self, s: ArrayLike) -> Any:
@@ -76,21 +80,26 @@ class AbstractBasis(AbstractSpace):
         """Φᵀ f / q."""
         values = self._field(values)
         projection = self.functions(self.grid).T / len(self.grid)
-        return jnp.tensordot(jnp.asarray(projection, values.dtype), values, axes=1, precision="highest")
+        return jnp.tensordot(
+            jnp.asarray(projection, values.dtype), values, axes=1, precision="highest"
+        )
 
     def _quadrature(self, num_quadrature: int | None, default: int, least: int, rule: str) -> int:
         """The number of points, checked."""
-        count = positive_integer(default if num_quadrature is None else num_quadrature, "num_quadrature")
+        count = positive_integer(
+            default if num_quadrature is None else num_quadrature, "num_quadrature"
+        )
         require(
             count >= least,
-            f"`num_quadrature` must be at least {rule} = {least}, or the functions are not orthonormal on the grid; "
-            f"got {num_quadrature}.",
+            f"`num_quadrature` must be at least {rule} = {least}, or the functions are not "
+            f"orthonormal on the grid; got {num_quadrature}.",
         )
         return count
 
 
 class FourierBasis(AbstractBasis):
-    """Closed curves of finite bandwidth, or periodic functions: coefficients of 2 num_modes + 1 functions in the order
+    """Closed curves of finite bandwidth, or periodic functions: coefficients of 2 num_modes + 1
+    functions in the order
 
         1, √2 cos s, √2 sin s, √2 cos 2s, √2 sin 2s, ..., √2 cos ms, √2 sin ms      (m = num_modes),
 
@@ -100,7 +109,8 @@ class FourierBasis(AbstractBasis):
 
     - `num_modes`: m, the highest frequency.
     - `dim`: dimension of the space in which the curve lies; 1 for a function.
-    - `num_quadrature`: q, at least 2m + 1. With the default max(4m, 32) the coefficients of a field that is
+    - `num_quadrature`: q, at least 2m + 1. With the default max(4m, 32) the coefficients of a field
+      that is
         quadratic in the curve are exact.
     """
 
@@ -112,7 +122,9 @@ class FourierBasis(AbstractBasis):
         self.num_modes = positive_integer(num_modes, "num_modes")
         self.dim = positive_integer(dim, "dim")
         default = max(4 * self.num_modes, 32)
-        self.num_quadrature = self._quadrature(num_quadrature, default, self.size, "2 num_modes + 1")
+        self.num_quadrature = self._quadrature(
+            num_quadrature, default, self.size, "2 num_modes + 1"
+        )
 
     @property
     def size(self) -> int:
@@ -130,7 +142,8 @@ class FourierBasis(AbstractBasis):
 
 
 class AbstractIntervalBasis(AbstractBasis):
-    """Waves on [0, length] from some lowest number of half waves up to num_modes, orthonormal in L²(ds / length).
+    """Waves on [0, length] from some lowest number of half waves up to num_modes, orthonormal in
+    L²(ds / length).
 
     The q points are midpoints of q equal parts.
 
@@ -139,7 +152,8 @@ class AbstractIntervalBasis(AbstractBasis):
     - `num_modes`: m, the highest number of half waves.
     - `dim`: number of values at a point; 1 for a function.
     - `length`: of the interval.
-    - `num_quadrature`: q, at least m + 1. With the default max(2m + 2, 32) the coefficients of a field that is cubic in
+    - `num_quadrature`: q, at least m + 1. With the default max(2m + 2, 32) the coefficients of a
+      field that is cubic in
         the function are exact (a quadratic field of sines is no finite sum of sines).
     """
 
@@ -149,12 +163,16 @@ class AbstractIntervalBasis(AbstractBasis):
     num_quadrature: int = eqx.field(static=True)
     lowest: eqx.AbstractClassVar[int]
 
-    def __init__(self, num_modes: int, dim: int, *, length: float = 1.0, num_quadrature: int | None = None):
+    def __init__(
+        self, num_modes: int, dim: int, *, length: float = 1.0, num_quadrature: int | None = None
+    ):
         self.num_modes = positive_integer(num_modes, "num_modes")
         self.dim = positive_integer(dim, "dim")
         self.length = known_number(length, "length", "a positive number", lambda value: value > 0)
         default = max(2 * self.num_modes + 2, 32)
-        self.num_quadrature = self._quadrature(num_quadrature, default, self.num_modes + 1, "num_modes + 1")
+        self.num_quadrature = self._quadrature(
+            num_quadrature, default, self.num_modes + 1, "num_modes + 1"
+        )
 
     @property
     def size(self) -> int:
@@ -173,9 +191,11 @@ class AbstractIntervalBasis(AbstractBasis):
 
 
 class SineBasis(AbstractIntervalBasis):
-    """Functions on [0, length] that vanish at its ends (Dirichlet): coefficients of num_modes functions
+    """Functions on [0, length] that vanish at its ends (Dirichlet): coefficients of num_modes
+    functions
 
-        √2 sin(π s / length), √2 sin(2π s / length), ..., √2 sin(mπ s / length)      (m = num_modes).
+        √2 sin(π s / length), √2 sin(2π s / length), ..., √2 sin(mπ s / length)      (m =
+        num_modes).
 
     **Arguments:** those of `AbstractIntervalBasis`.
     """
@@ -187,9 +207,11 @@ class SineBasis(AbstractIntervalBasis):
 
 
 class CosineBasis(AbstractIntervalBasis):
-    """Functions on [0, length] without slope at its ends (Neumann): coefficients of num_modes + 1 functions
+    """Functions on [0, length] without slope at its ends (Neumann): coefficients of num_modes + 1
+    functions
 
-        1, √2 cos(π s / length), √2 cos(2π s / length), ..., √2 cos(mπ s / length)      (m = num_modes).
+        1, √2 cos(π s / length), √2 cos(2π s / length), ..., √2 cos(mπ s / length)      (m =
+        num_modes).
 
     **Arguments:** those of `AbstractIntervalBasis`.
     """
@@ -203,7 +225,8 @@ class CosineBasis(AbstractIntervalBasis):
 
 
 class FourierSquare(AbstractBasis):
-    """Functions on [0, 2π)², periodic in both directions: coefficients of (2 num_modes + 1)² products of functions
+    """Functions on [0, 2π)², periodic in both directions: coefficients of (2 num_modes + 1)²
+    products of functions
 
         φ_i(s) φ_j(t), φ those of `FourierBasis`, row i (2 num_modes + 1) + j of a state,
 

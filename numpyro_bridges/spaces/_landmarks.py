@@ -13,16 +13,17 @@ from ._basis import fourier_functions
 class Landmarks(AbstractSpace):
     """n points x_i in R^dim with quadrature weights w_i; row i of a state is the point x_i.
 
-    As a closed curve, x_i is its point at s_i = 2π i / n, and between the points it is the trigonometric
-    interpolant: the curve of least bandwidth through them, exact if all frequencies of the curve are below
-    n/2 (for an even n the frequency n/2 is a cosine). For points that are no curve everything has its meaning
-    but `evaluate`, `project` and `refine`.
+    As a closed curve, x_i is its point at s_i = 2π i / n, and between the points it is the
+    trigonometric interpolant: the curve of least bandwidth through them, exact if all frequencies
+    of the curve are below n/2 (for an even n the frequency n/2 is a cosine). For points that are no
+    curve everything has its meaning but `evaluate`, `project` and `refine`.
 
     **Arguments:**
 
     - `num_points`: n.
     - `dim`: dimension of the space in which the points lie.
-    - `weights`: w, a positive scalar or one for each point. With the default 1/n the curve has unit mass, and
+    - `weights`: w, a positive scalar or one for each point. With the default 1/n the curve has unit
+      mass, and
         its H-norm does not depend on n; with `1.0` variances are per landmark.
     """
 
@@ -36,10 +37,12 @@ class Landmarks(AbstractSpace):
         w = as_float(1.0 / self.num_points if weights is None else weights, "weights")
         require(
             w.shape in ((), (self.num_points,)),
-            f"`weights` must be a scalar or of shape ({self.num_points},), one for each point; got shape {w.shape}.",
+            f"`weights` must be a scalar or of shape ({self.num_points},), one for each point; got "
+            f"shape {w.shape}.",
         )
         require_positive(w, "weights", "A point that is not seen is left out by the condition.")
-        self.weights = jnp.broadcast_to(w.astype(w.dtype), (self.num_points,))  # a strong dtype: `jit` keys on it
+        # a strong dtype: `jit` keys on it
+        self.weights = jnp.broadcast_to(w.astype(w.dtype), (self.num_points,))
 
     @property
     def size(self) -> int:
@@ -56,7 +59,8 @@ class Landmarks(AbstractSpace):
         """Column i is the trigonometric interpolant of 1 at s_i and 0 at the other points."""
         num_modes = self.num_points // 2
         coefficients = fourier_functions(self.grid, num_modes).T / self.num_points
-        if self.num_points % 2 == 0:  # on the grid √2 cos(ns/2) has squared norm 2, and the sine vanishes
+        # on the grid √2 cos(ns/2) has squared norm 2, and the sine vanishes
+        if self.num_points % 2 == 0:
             coefficients[-2:] *= [[0.5], [0.0]]
         functions = fourier_functions(s, num_modes)
         return jnp.asarray(functions @ coefficients.astype(functions.dtype))

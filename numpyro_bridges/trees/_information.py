@@ -26,13 +26,19 @@ class Information(NamedTuple):
         return cls(H, F.reshape(like.shape), c)
 
     @classmethod
-    def told_by(cls, seen: Observation, observed: State, factor: Structured, like: State) -> "Information":
+    def told_by(
+        cls, seen: Observation, observed: State, factor: Structured, like: State
+    ) -> "Information":
         """Of an observation whose error has this factor."""
-        message = GaussianMessage(seen.operator, jnp.zeros_like(observed), factor, observed, seen.log_scale)
+        message = GaussianMessage(
+            seen.operator, jnp.zeros_like(observed), factor, observed, seen.log_scale
+        )
         return cls.of(message, like)
 
     def as_observation(self) -> tuple[Observation, State, Float[Array, ""]]:
-        """The same as an observation w = Rᵀ y + N(0, I), R Rᵀ = H, and the log density that it has too much."""
+        """The same as an observation w = Rᵀ y + N(0, I), R Rᵀ = H, and the log density that it has
+        too much.
+        """
         R = cholesky(self.H + nugget(self.H))
         w = solve_lower(R, self.F)
         one = jnp.ones((), R.dtype)
@@ -41,6 +47,6 @@ class Information(NamedTuple):
 
 
 def nugget(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Added to a matrix of which some directions may have nothing, relative to its largest entry."""
+    """Added to a matrix that may lack some directions, relative to its largest entry."""
     relative = 1e-12 if S.dtype == jnp.float64 else 1e-6
     return relative * jnp.max(jnp.diagonal(S)) * jnp.eye(S.shape[0], dtype=S.dtype)

@@ -1,9 +1,10 @@
 """Trees from Newick and NEXUS text, read by DendroPy.
 
-Of the readers compared, the package `newick` reads a branch with two lengths, `c:2:1`, as 21, and its errors have no
-position; hyperiax's reader knows neither quotes nor comments; DendroPy has positions, quotes, comments, and NEXUS with
-its table of translations. It takes the last of two lengths, so that is looked for beforehand, and comments are taken
-out, since one before a quoted name hides the quote.
+Of the readers compared, the package `newick` reads a branch with two lengths, `c:2:1`, as 21, and
+its errors have no position; hyperiax's reader knows neither quotes nor comments; DendroPy has
+positions, quotes, comments, and NEXUS with its table of translations. It takes the last of two
+lengths, so that is looked for beforehand, and comments are taken out, since one before a quoted
+name hides the quote.
 """
 
 import re
@@ -21,7 +22,9 @@ _TWO_LENGTHS = re.compile(r":[^,();:]*(:)")
 
 
 class Parsed(NamedTuple):
-    """Nodes in preorder; the parent of the root is −1, and the length of its edge `None` where none is written."""
+    """Nodes in preorder; the parent of the root is −1, and the length of its edge `None` where none
+    is written.
+    """
 
     parents: list[int]
     lengths: list[float | None]
@@ -29,7 +32,9 @@ class Parsed(NamedTuple):
 
 
 def text_of(source: str | PathLike) -> str:
-    """Text as it is, the content of a file by its path. Newick text has a parenthesis or a semicolon."""
+    """Text as it is, the content of a file by its path. Newick text has a parenthesis or a
+    semicolon.
+    """
     if isinstance(source, str) and re.search(r"[(;]", source):
         return source
     return as_path(source, "source").read_text(encoding="utf-8-sig")
@@ -43,15 +48,22 @@ def parse(source: str | PathLike, index: int | None, preserve_underscores: bool)
     if not _is_nexus(text) and not text.rstrip().endswith(";"):
         text = text.rstrip() + ";"  # a file may end without
     found = _TWO_LENGTHS.search(_hidden_quotes(text))
-    require(found is None, f"{place}a branch has two lengths, {_position(text, found)}. Keep one of them.")
+    require(
+        found is None,
+        f"{place}a branch has two lengths, {_position(text, found)}. Keep one of them.",
+    )
     trees = _read(text, place, preserve_underscores)
     require(len(trees) > 0, f"{place}`source` must hold a tree; got {words(text.strip())}.")
     require(
         index is not None or len(trees) == 1,
-        f"{place}`source` holds {len(trees)} trees where one is asked for: choose one by `index`, from 0 on.",
+        f"{place}`source` holds {len(trees)} trees where one is asked for: choose one by `index`, "
+        "from 0 on.",
     )
     chosen = 0 if index is None else positive_integer(index, "index", least=0)
-    require(chosen < len(trees), f"{place}`index` must be below the number of trees, {len(trees)}; got {index}.")
+    require(
+        chosen < len(trees),
+        f"{place}`index` must be below the number of trees, {len(trees)}; got {index}.",
+    )
     return _nodes(trees[chosen])
 
 
@@ -86,7 +98,10 @@ def _read(text: str, place: str, preserve_underscores: bool) -> Any:
     try:
         return dendropy.TreeList.get(data=text, schema="nexus" if nexus else "newick", **settings)
     except Exception as error:  # DendroPy's errors have no class in common, and say where
-        cure = "Parentheses must match, and a name with a blank, a comma or a parenthesis needs quotes, 'H. sapiens'."
+        cure = (
+            "Parentheses must match, and a name with a blank, a comma or a parenthesis needs "
+            "quotes, 'H. sapiens'."
+        )
         raise ValueError(f"{place}`source` must be Newick or NEXUS: {error}. {cure}") from error
 
 
@@ -113,7 +128,9 @@ def _name(node: Any) -> str | None:
 
 
 def _is_support(label: str) -> bool:
-    """Inner nodes carry bootstrap and posterior supports, `95` or `0.98/100`, where a name would be."""
+    """Inner nodes carry bootstrap and posterior supports, `95` or `0.98/100`, where a name would
+    be.
+    """
     try:
         return bool(np.all([np.isfinite(float(part)) for part in label.split("/")]))
     except ValueError:

@@ -4,8 +4,9 @@ With C = K Kᵀ the root is x = x0 + K u, u ~ N(0, I), and the message at it, as
 
     h(x) = exp(c + Fᵀu − ½ uᵀHu).
 
-With N Nᵀ = 1 + H its integral against the prior is exp(c + ½ |N⁻¹F|²) / |N|. The root is drawn from the posterior under
-h, u = N⁻ᵀ(N⁻¹F + z), of log density −½ |z|² + log|N| up to what N(u; 0, I) has too.
+With N Nᵀ = 1 + H its integral against the prior is exp(c + ½ |N⁻¹F|²) / |N|. The root is drawn from
+the posterior under h, u = N⁻ᵀ(N⁻¹F + z), of log density −½ |z|² + log|N| up to what N(u; 0, I) has
+too.
 """
 
 from typing import TypeAlias
@@ -15,7 +16,16 @@ import jax.numpy as jnp
 import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._linalg import apply, cholesky, columns, congruence, log_diagonal, solve_lower, symmetric, transpose
+from .._linalg import (
+    apply,
+    cholesky,
+    columns,
+    congruence,
+    log_diagonal,
+    solve_lower,
+    symmetric,
+    transpose,
+)
 from .._types import State, Structured
 
 Message: TypeAlias = tuple[Float[Array, "n n"], State, Float[Array, ""]]
@@ -44,17 +54,23 @@ class Root(eqx.Module):
         """A draw from the prior."""
         return self.x0 if self.factor is None else self.x0 + apply(self.factor, self._used(noise))
 
-    def posterior(self, message: Message, noise: Float[Array, "rows k *dim"]) -> tuple[State, Float[Array, ""]]:
+    def posterior(
+        self, message: Message, noise: Float[Array, "rows k *dim"]
+    ) -> tuple[State, Float[Array, ""]]:
         """A draw from the posterior, and log prior/posterior there."""
         if self.factor is None:
             return self.x0, jnp.zeros((), self.x0.dtype)
         N, pull, _ = self._solved(message)
         z = self._used(noise)
         u = solve_lower(N, pull + z, transposed=True)
-        log_ratio = 0.5 * jnp.sum(z * z) - 0.5 * jnp.sum(u * u) - columns(u) * log_diagonal(N, len(u))
+        log_ratio = (
+            0.5 * jnp.sum(z * z) - 0.5 * jnp.sum(u * u) - columns(u) * log_diagonal(N, len(u))
+        )
         return self.x0 + apply(self.factor, u), log_ratio
 
-    def noise_of(self, message: Message, x: State, k: int, key: PRNGKeyArray) -> Float[Array, "rows k *dim"]:
+    def noise_of(
+        self, message: Message, x: State, k: int, key: PRNGKeyArray
+    ) -> Float[Array, "rows k *dim"]:
         """The noise with which x is drawn; what has no effect is drawn with the key."""
         free = jr.normal(key, (self.num_rows(k), k, *x.shape[1:]), x.dtype)
         if self.factor is None:

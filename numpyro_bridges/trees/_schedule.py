@@ -1,9 +1,10 @@
 """In which order a tree's branches are walked, and where what is still needed is kept meanwhile.
 
-Branches are walked in rounds: on the way down those of a round start at nodes of earlier ones, the way up is the
-reverse. Within rounds of few places the order is depth first, the largest subtree last. A node is then needed no more
-when its last subtree begins, and not many more than log₂(number of nodes) of them are kept at a time: memory and
-derivatives cost no more than the branches, whatever the shape.
+Branches are walked in rounds: on the way down those of a round start at nodes of earlier ones, the
+way up is the reverse. Within rounds of few places the order is depth first, the largest subtree
+last. A node is then needed no more when its last subtree begins, and not many more than log₂(number
+of nodes) of them are kept at a time: memory and derivatives cost no more than the branches,
+whatever the shape.
 """
 
 from collections.abc import Sequence
@@ -17,24 +18,32 @@ _MAX_IDLE = 0.5
 
 
 class Schedule(NamedTuple):
-    """Static numbers. *Ends* are nodes on which nothing that is seen hangs any more, *inner* ones the others."""
+    """Static numbers. *Ends* are nodes on which nothing that is seen hangs any more, *inner* ones
+    the others.
+    """
 
     ends: tuple[int, ...]
     """Nodes at the ends, in preorder."""
     inner: tuple[int, ...]
     """Inner nodes but the root, in the order of the way down."""
     active: tuple[int, ...]
-    """Nodes but the root that have something seen below or at them, in preorder: those that have noise."""
+    """Nodes but the root that have something seen below or at them, in preorder: those that have
+    noise.
+    """
     rounds: tuple[tuple[int, ...], ...]
     """For each round of the way down the places in `inner` of its nodes."""
     num_slots: int
     slot: tuple[int, ...]
-    """For each node of `inner` where its state is kept, `num_slots` where nothing inner hangs on it."""
+    """For each node of `inner` where its state is kept, `num_slots` where nothing inner hangs on
+    it.
+    """
     parent_slot: tuple[int, ...]
     """For each node of `inner` where its parent's state is kept; that of the root is in slot 0."""
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """`rounds` as an array, a place of no node holding the round's first once more, and which of them are nodes."""
+        """`rounds` as an array, a place of no node holding the round's first once more, and which
+        of them are nodes.
+        """
         width = max(map(len, self.rounds), default=1)
         filled = [nodes + nodes[:1] * (width - len(nodes)) for nodes in self.rounds]
         taken = [[i < len(nodes) for i in range(width)] for nodes in self.rounds]
@@ -111,7 +120,9 @@ def _rounds_of(width: int, order: Sequence[int], parents: Sequence[int]) -> list
 
 
 def _slots(rounds, parents, children) -> tuple[dict[int, int], int]:
-    """For each node that has inner children a place until they have read it. A round reads before it writes."""
+    """For each node that has inner children a place until they have read it. A round reads before
+    it writes.
+    """
     slot_of, taken, free = {0: 0}, 1, []
     remaining = {node: len(own) for node, own in children.items()}
     for nodes in rounds:

@@ -4,18 +4,18 @@ What is seen below a node is told to the branch above it by a Gaussian message
 
     h(x) = exp(c + Fᵀ(x − o) − ½ (x − o)ᵀ H (x − o)),
 
-o being the node's anchor, near which coefficients are linearised. Where branches meet messages are multiplied: H, F and
-c are added, the normalising constants too. A branch is guided like a bridge: one that leads to an end by the
-observation there, one that leads to an inner node by its message, which is an observation Rᵀ x + N(0, I) with R Rᵀ = H.
-A guide that follows the state is told of a mean at a later time instead (`_told.py`). With every step of every branch
-guided by some q,
+o being the node's anchor, near which coefficients are linearised. Where branches meet messages are
+multiplied: H, F and c are added, the normalising constants too. A branch is guided like a bridge:
+one that leads to an end by the observation there, one that leads to an inner node by its message,
+which is an observation Rᵀ x + N(0, I) with R Rᵀ = H. A guide that follows the state is told of a
+mean at a later time instead (`_told.py`). With every step of every branch guided by some q,
 
     Ψ = Σ_branches Σ_k [log p − log q](x_{k+1} | x_k) + Σ_{seen nodes} log p(v | x),
     E exp Ψ = p(all data | x_root),
 
-exactly for the time-discretised model: messages of inner nodes only guide, so approximating them costs variance and no
-bias. Where the process is linear and the messages are its own, Ψ is the same number for every noise: the message at the
-root.
+exactly for the time-discretised model: messages of inner nodes only guide, so approximating them
+costs variance and no bias. Where the process is linear and the messages are its own, Ψ is the same
+number for every noise: the message at the root.
 """
 
 from collections import Counter
@@ -33,7 +33,16 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .._linalg import apply, full_precision, promote, rows, varying_like
 from .._types import State
 from ..conditioning import AbstractCondition, GaussianMessage, Observation, lift
-from ..guiding import AbstractGuide, AbstractPlan, FrozenGuide, default_guide, reach, retrace, retrace_reach, travel
+from ..guiding import (
+    AbstractGuide,
+    AbstractPlan,
+    FrozenGuide,
+    default_guide,
+    reach,
+    retrace,
+    retrace_reach,
+    travel,
+)
 from ..sdes import AbstractSDE, AffineStep, BrownianMotion, Displaced
 from ._information import Information
 from ._root import Root
@@ -91,8 +100,11 @@ class TreeProblem(eqx.Module):
     schedule: Schedule = eqx.field(static=True)
 
     @classmethod
-    def of(cls, sde, guide, root: Root, tree: Tree, conditions, num_steps: int, t0, own) -> "TreeProblem":
-        """With every anchor at the root: for linear processes, for simulation, and before `anchored`.
+    def of(
+        cls, sde, guide, root: Root, tree: Tree, conditions, num_steps: int, t0, own
+    ) -> "TreeProblem":
+        """With every anchor at the root: for linear processes, for simulation, and before
+        `anchored`.
 
         `own`: the SDEs of all branches along a leading axis, `sde` being one of them, or `None`.
         """
@@ -110,7 +122,9 @@ class TreeProblem(eqx.Module):
         return cls(sde, guide, root, branches, conditions, tree.parents, observed, num_steps, walk)
 
     def anchored(self, t0) -> "TreeProblem":
-        """With anchors where a Brownian motion would be, given the data, for processes and guides that need some."""
+        """With anchors where a Brownian motion would be, given the data, for processes and guides
+        that need some.
+        """
         if self.sde.has_exact_transition or self.follows:
             return self
         walker, own = self._walker(None, t0), self.branches.own
@@ -120,7 +134,11 @@ class TreeProblem(eqx.Module):
         active = np.array(self.schedule.active)
         still = jnp.zeros((rough.num_noises, *self.x0.shape), self.x0.dtype)
         paths, _ = rough.down(rough.up(), still)
-        anchors = jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape)).at[active].set(paths[:, -1])
+        anchors = (
+            jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape))
+            .at[active]
+            .set(paths[:, -1])
+        )
         anchors = anchors.at[0].set(paths[0, 0])
         above = np.array(self.parents[1:])
         branches = self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above])
@@ -149,7 +167,9 @@ class TreeProblem(eqx.Module):
 
     @property
     def follows(self) -> bool:
-        """Whether what is seen below a node is told by a mean, for the guide's covariances to follow the state."""
+        """Whether what is seen below a node is told by a mean, for the guide's covariances to
+        follow the state.
+        """
         if self.branches.own is not None:
             return False
         branch = jax.tree.map(lambda a: a[0], self.branches)
@@ -182,7 +202,9 @@ class TreeProblem(eqx.Module):
 
     @full_precision
     def log_likelihoods(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, " seen"]:
-        """For each seen node what its datum is given its state, or, at an end, the terms of what leads to it alone."""
+        """For each seen node what its datum is given its state, or, at an end, the terms of what
+        leads to it alone.
+        """
         schedule, place = self.schedule, {node: i for i, node in enumerate(self.schedule.active)}
         at_inner = np.array([place[node] for node in schedule.inner], int)
         paths, log_weights = self.down(self.up(), noise)
@@ -194,7 +216,7 @@ class TreeProblem(eqx.Module):
         return by_node[np.array(self.observed)]
 
     def _leads_to(self, nodes: Sequence[int]) -> np.ndarray:
-        """For each of all active nodes the last one below it to which nothing but its branch leads."""
+        """For each active node the last one below it to which nothing but its branch leads."""
         last = {}
         above = Counter(self.parents[node] for node in nodes)
         for node in reversed(nodes):
@@ -219,14 +241,16 @@ class TreeProblem(eqx.Module):
         return self.down(self.up(), noise)[0]
 
     def at_nodes(self, paths: Float[Array, "branches K+1 n *dim"]) -> Float[Array, "nodes n *dim"]:
-        """The states of all nodes, from those along the branches; NaN for nodes that lead to nothing seen."""
+        """The states of all nodes, from those along the branches; NaN for nodes that lead to
+        nothing seen.
+        """
         states = jnp.full((len(self.parents), *self.x0.shape), jnp.nan, paths.dtype)
         root = paths[0, 0]  # the first branch, in preorder, starts there
         return states.at[np.array(self.schedule.active)].set(paths[:, -1]).at[0].set(root)
 
     @full_precision
     def noise_from_paths(self, paths, key: PRNGKeyArray) -> Float[Array, "steps k *dim"]:
-        """The noise with `paths(noise) = paths`; what they leave free of it is drawn with the key."""
+        """The noise with `paths(noise) = paths`; what they leave free is drawn with the key."""
         up, walk = self.up(), self.schedule
         place = {node: i for i, node in enumerate(walk.active)}
 
@@ -264,7 +288,11 @@ class TreeProblem(eqx.Module):
         def step(states, inputs):
             node, parent, branch, is_end, z = inputs
             x, edge = states[parent], self._edge(branch)
-            ts = jnp.where(is_end, self._grid(branch.length, self.conditions.exact), self._grid(branch.length, False))
+            ts = jnp.where(
+                is_end,
+                self._grid(branch.length, self.conditions.exact),
+                self._grid(branch.length, False),
+            )
 
             def move(y, inputs):
                 s, t, z = inputs
@@ -305,11 +333,15 @@ class TreeProblem(eqx.Module):
         return self.sde if own is None else eqx.combine(own, self.sde)
 
     def _inner_grid(self, branch: Branch) -> Array:
-        """Times with an entry of a plan at the end too: the last step to an inner node is led like the others."""
+        """Times with an entry of a plan at the end too: the last step to an inner node is led like
+        the others.
+        """
         ts = self._grid(branch.length, False)
         return jnp.concatenate([ts, ts[-1:]])
 
-    def _inner_plan(self, branch: Branch, seen: Observation, observed: State, reference: State, *beyond):
+    def _inner_plan(
+        self, branch: Branch, seen: Observation, observed: State, reference: State, *beyond
+    ):
         edge, ts = self._edge(branch), self._inner_grid(branch)
         if branch.steps is not None:
             assert isinstance(self.guide, FrozenGuide)
@@ -317,12 +349,16 @@ class TreeProblem(eqx.Module):
         guide = self._prepared(branch, seen, observed, reference, ts)
         return guide.plan(edge, seen, reference, ts, *beyond)
 
-    def _prepared(self, branch: Branch, seen: Observation, observed: State, reference: State, ts) -> AbstractGuide:
+    def _prepared(
+        self, branch: Branch, seen: Observation, observed: State, reference: State, ts
+    ) -> AbstractGuide:
         start = branch.parent_anchor - branch.anchor
         return self.guide.prepared(self._edge(branch), seen, observed, reference, ts, start)
 
     def _with_steps(self, branches: Branch) -> Branch:
-        """Inner branches with all that can be known before any message, in one program for all of them."""
+        """Inner branches with all that can be known before any message, in one program for all of
+        them.
+        """
         guide = self.guide
         if not isinstance(guide, FrozenGuide) or guide.rounds:
             return branches
@@ -332,7 +368,8 @@ class TreeProblem(eqx.Module):
             steps = guide.steps(self._edge(branch), here, self._grid(branch.length, False))
             one, n = jnp.ones((), here.dtype), len(here)
             operator = promote(one, steps.operator.ndim - 1, n)
-            still = AffineStep(operator, here, promote(0 * one, steps.covariance.ndim - 1, n))  # the end is in no time
+            # the end is in no time
+            still = AffineStep(operator, here, promote(0 * one, steps.covariance.ndim - 1, n))
             return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), steps, still)
 
         steps = jax.vmap(of)(branches)
@@ -345,7 +382,9 @@ class TreeProblem(eqx.Module):
         zero = jnp.zeros((), self.x0.dtype)
         message = plan.message(entry, self._edge(branch), zero, between, observed)
         shift = message.shift + apply(message.operator, between)
-        message = GaussianMessage(message.operator, shift, message.factor, observed, message.log_scale)
+        message = GaussianMessage(
+            message.operator, shift, message.factor, observed, message.log_scale
+        )
         return Information.of(message, self.x0)
 
     def _seen(self, condition: AbstractCondition, anchor: State) -> tuple[Observation, State]:
@@ -388,17 +427,23 @@ class TreeProblem(eqx.Module):
             return message._replace(c=message.c + c), (plan, w)
 
         own = self._own_messages(jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
-        at_root, (plans, data) = self._summed_up(own, joined, self._with_steps(self._of(self.schedule.inner)))
+        at_root, (plans, data) = self._summed_up(
+            own, joined, self._with_steps(self._of(self.schedule.inner))
+        )
         return UpwardPass(plans, data, ends, at_root)
 
     def _up_with_means(self, ends: Led) -> UpwardPass:
-        """Each branch by the mean of what is seen below, of whatever covariance the process has there."""
+        """Each branch by the mean of what is seen below, of whatever covariance the process has
+        there.
+        """
         first = jax.tree.map(lambda a: a[0], self.branches)
         zero = jnp.zeros((), self.x0.dtype)
         part = Part.of(*self._edge(first).noise(zero, jnp.zeros_like(self.x0)))
 
         def of_end(led, branch):
-            return told_by(part.seen(led.seen), led.observed, branch.length, part.a, part.of_state(self.x0))
+            return told_by(
+                part.seen(led.seen), led.observed, branch.length, part.a, part.of_state(self.x0)
+            )
 
         def of_node(condition, anchor):
             seen, observed = self._seen(condition, anchor)
@@ -409,7 +454,9 @@ class TreeProblem(eqx.Module):
 
         def led(total, branch):
             seen, value, beyond, reference = as_seen(total, part.a, everything)
-            return self._inner_plan(branch, part.known(seen), value, part.lifted(reference), beyond), value
+            return self._inner_plan(
+                branch, part.known(seen), value, part.lifted(reference), beyond
+            ), value
 
         # for each end the identity, or fewer directions than ever are seen
         everything = ends.seen.operator.ndim == 1 or part.basis is not None
@@ -420,10 +467,14 @@ class TreeProblem(eqx.Module):
         return UpwardPass(plans, data, ends, part.message(at_root.information))
 
     def _own_messages(self, messages, of_node):
-        """For each node of the tree what is told by what is seen of it and by the ends that hang on it."""
+        """For each node of the tree what is told by what is seen of it and by the ends that hang on
+        it.
+        """
         schedule, count = self.schedule, len(self.parents)
         above = np.array(self.parents)[list(schedule.ends)]
-        totals = jax.tree.map(lambda a: jnp.zeros((count, *a.shape[1:]), a.dtype).at[above].add(a), messages)
+        totals = jax.tree.map(
+            lambda a: jnp.zeros((count, *a.shape[1:]), a.dtype).at[above].add(a), messages
+        )
         inside = [node for node in (0, *schedule.inner) if node in self.observed]
         if inside:
             own = jax.vmap(of_node)(self._rows(inside), self._anchors(inside))
@@ -431,18 +482,24 @@ class TreeProblem(eqx.Module):
         return totals
 
     def _summed_up(self, own, joined, branches: Branch):
-        """The sum of what is told at the root, and what `joined` makes of it at inner nodes, as the schedule has them.
+        """The sum of what is told at the root, and what `joined` makes of it at inner nodes, as the
+        schedule has them.
 
-        `joined(total, branch)` gives what the node's branch, one of `branches`, tells its parent, and what is kept.
+        `joined(total, branch)` gives what the node's branch, one of `branches`, tells its parent,
+        and what is kept.
         """
         schedule = self.schedule
         places, taken = schedule.places()
-        kept = jax.tree.map(lambda a: jnp.zeros((schedule.num_slots + 1, *a.shape[1:]), a.dtype), own)
+        kept = jax.tree.map(
+            lambda a: jnp.zeros((schedule.num_slots + 1, *a.shape[1:]), a.dtype), own
+        )
         kept = varying_like(kept, self.sde, self.branches, own)
 
         def step(kept, inputs):
             own, branch, slot, parent_slot, taken = inputs
-            message, out = jax.vmap(joined)(jax.tree.map(lambda a, b: a + b[slot], own, kept), branch)
+            message, out = jax.vmap(joined)(
+                jax.tree.map(lambda a, b: a + b[slot], own, kept), branch
+            )
             is_read = jnp.zeros((schedule.num_slots + 1,), bool).at[slot].set(True)
 
             def renewed(a: Array, b: Array) -> Array:
@@ -458,11 +515,14 @@ class TreeProblem(eqx.Module):
         return jax.tree.map(lambda a, b: a[0] + b[0], own, kept), _picked_out(out, schedule)
 
     def log_evidence(self, up: UpwardPass) -> Float[Array, ""]:
-        """The message at the root under its prior: the log likelihood itself where the process is linear."""
+        """The message at the root under its prior: the log likelihood itself where the process is
+        linear.
+        """
         return self.root.log_evidence(up.at_root)
 
     def down(self, up: UpwardPass, noise: Float[Array, "steps k *dim"]):
-        """States of every active node's branch `(active, K + 1, n, dim)`, and the terms of Ψ, one for each block.
+        """States of every active node's branch `(active, K + 1, n, dim)`, and the terms of Ψ, one
+        for each block.
 
         Blocks are the branches, behind the root where it varies.
         """
@@ -490,8 +550,12 @@ class TreeProblem(eqx.Module):
             return states, (path, log_weight)
 
         of_inner = self._of(inner), up.plans, up.data, noise[at_inner]
-        slot, parent_slot = np.array(schedule.slot, int)[places], np.array(schedule.parent_slot, int)[places]
-        nowhere = schedule.num_slots + np.arange(places.shape[1])  # a place each, behind the last slot
+        slot, parent_slot = (
+            np.array(schedule.slot, int)[places],
+            np.array(schedule.parent_slot, int)[places],
+        )
+        # a place each, behind the last slot
+        nowhere = schedule.num_slots + np.arange(places.shape[1])
         slot = np.where(taken & (slot < schedule.num_slots), slot, nowhere)
         _, out = jax.lax.scan(step, states, (_picked(of_inner, places), slot, parent_slot))
         inner_paths, inner_weights = _picked_out(out, schedule)
@@ -501,7 +565,9 @@ class TreeProblem(eqx.Module):
 
         def end(led, branch, x, z):
             plan, seen, observed, ts = led
-            path, log_weight = reach(self._edge(branch), plan, seen, ts, x - branch.anchor, z, observed)
+            path, log_weight = reach(
+                self._edge(branch), plan, seen, ts, x - branch.anchor, z, observed
+            )
             return jnp.concatenate([x[None], branch.anchor[None] + path]), log_weight
 
         end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
@@ -518,7 +584,9 @@ class TreeProblem(eqx.Module):
         return paths, log_weights
 
     def _log_density_inside(self, states):
-        """Log density of what is seen at the root and at inner nodes, given their states; 0 where nothing is."""
+        """Log density of what is seen at the root and at inner nodes, given their states; 0 where
+        nothing is.
+        """
         inner = (0, *self.schedule.inner)
         chosen = [i for i, node in enumerate(inner) if node in self.observed]
         if not chosen:

@@ -1,18 +1,20 @@
 """What is seen below a node, for guides whose covariances follow the state.
 
-A guide that follows wants of a node what it wants of an observation, and beside it the time beyond: a law
+A guide that follows wants of a node what it wants of an observation, and beside it the time beyond:
+a law
 
     value = L x + N(0, Σ + κ L a Lᵀ)
 
-of the state x, for whatever covariance a the process has where a path is. With a = a₀ frozen, messages of a Brownian
-motion give H = Lᵀ (Σ + κ L a₀ Lᵀ)⁻¹ L and F = H x̂. The part κ is the time to the tips of a tree on which nothing but
-branches counts, where the tips' errors are at most the true ones; parallel sums of positive matrices are monotone, so
-what is left, Σ, is a covariance:
+of the state x, for whatever covariance a the process has where a path is. With a = a₀ frozen,
+messages of a Brownian motion give H = Lᵀ (Σ + κ L a₀ Lᵀ)⁻¹ L and F = H x̂. The part κ is the time
+to the tips of a tree on which nothing but branches counts, where the tips' errors are at most the
+true ones; parallel sums of positive matrices are monotone, so what is left, Σ, is a covariance:
 
 - everything seen:      L = 1,    Σ = H⁻¹ − κ a₀,       value H⁻¹ F;
 - some of it:           L = Rᵀ,   Σ = 1 − κ Rᵀ a₀ R,    value R⁻¹ F,     R Rᵀ = H.
 
-A subtree is a tip whose branch is longer (Felsenstein 1973), and Σ is its error. a₀ is one for the tree.
+A subtree is a tip whose branch is longer (Felsenstein 1973), and Σ is its error. a₀ is one for the
+tree.
 """
 
 from typing import NamedTuple
@@ -28,14 +30,17 @@ from ..guiding import are_few
 from ._information import Information
 
 _KEPT = 0.01
-"""The part of κ a that does not follow: rounding, of whatever precision, is less than it and so leaves a covariance."""
+"""The part of κ a that does not follow: rounding, of whatever precision, is less than it and so
+leaves a covariance.
+"""
 
 
 class Part(NamedTuple):
-    """What messages are about: of a displacement x from the root all, or y = Q x where few noises drive it.
+    """What messages are about: of a displacement x from the root all, or y = Q x where few noises
+    drive it.
 
-    With σ = Qᵀ R at the root, Q of orthonormal rows, a = R Rᵀ is the covariance of y, and a state is taken for Qᵀ y: so
-    are all that the noise reaches where σ stays as it is.
+    With σ = Qᵀ R at the root, Q of orthonormal rows, a = R Rᵀ is the covariance of y, and a state
+    is taken for Qᵀ y: so are all that the noise reaches where σ stays as it is.
     """
 
     basis: Float[Array, "k n"] | None
@@ -73,7 +78,9 @@ class Part(NamedTuple):
     def message(self, message: Information) -> Information:
         """Of a displacement."""
         Q = self.basis
-        return message if Q is None else Information(Q.T @ message.H @ Q, Q.T @ message.F, message.c)
+        return (
+            message if Q is None else Information(Q.T @ message.H @ Q, Q.T @ message.F, message.c)
+        )
 
 
 class Told(NamedTuple):
@@ -134,6 +141,12 @@ def as_seen(told: Told, a: Structured, everything: bool) -> Seen:
     kappa = jnp.where(told.rate > 0, 1 / jnp.where(told.rate > 0, told.rate, 1.0), 0.0)
     kappa = (1 - _KEPT) * kappa
     error = whole - kappa * promote(congruence(operator, a), 2, n)
-    found = jnp.all(jnp.isfinite(cholesky(lax.stop_gradient(error))))  # and where it does not, nothing follows
+    # and where it does not, nothing follows
+    found = jnp.all(jnp.isfinite(cholesky(lax.stop_gradient(error))))
     factor = cholesky(jnp.where(found, error, whole))
-    return Seen(Observation(operator, factor, jnp.zeros((), dtype)), value, jnp.where(found, kappa, 0.0), mean)
+    return Seen(
+        Observation(operator, factor, jnp.zeros((), dtype)),
+        value,
+        jnp.where(found, kappa, 0.0),
+        mean,
+    )

@@ -1,4 +1,4 @@
-"""A rooted tree: its topology and its names are fixed, the lengths of its branches are parameters."""
+"""A rooted tree: topology and names are fixed, the lengths of its branches are parameters."""
 
 import difflib
 from collections import Counter
@@ -41,16 +41,18 @@ class Named(Protocol):
 class Tree(eqx.Module):
     """A rooted tree with a time along every branch.
 
-    Nodes are numbered in preorder, the root being 0 and children in the order in which they were given. A process
-    starts at the root: if there is time before the first split, the root has one child.
+    Nodes are numbered in preorder, the root being 0 and children in the order in which they were
+    given. A process starts at the root: if there is time before the first split, the root has one
+    child.
 
     - `parents`: for each node the number of its parent, −1 for the root.
-    - `lengths`: `(num_nodes - 1,)`, that of the branch above node i at i − 1, in the units of time of the SDE. They are
-      an array leaf, so that a prior on branch lengths or a clock is ordinary NumPyro: `tree.scaled(rates)`,
-      `tree.with_lengths(lengths)`.
+    - `lengths`: `(num_nodes - 1,)`, that of the branch above node i at i − 1, in the units of time
+      of the SDE. They are an array leaf, so that a prior on branch lengths or a clock is ordinary
+      NumPyro: `tree.scaled(rates)`, `tree.with_lengths(lengths)`.
     - `names`: for each node its name, or `None`.
-    - `observed`: numbers of the nodes that are seen, in preorder, one for each row of data: the tips unless said
-      otherwise, see `observing`. A node of which there are several specimens is there as often.
+    - `observed`: numbers of the nodes that are seen, in preorder, one for each row of data: the
+      tips unless said otherwise, see `observing`. A node of which there are several specimens is
+      there as often.
 
     Made by `from_newick`, `from_parents`, `chain` and `star`.
     """
@@ -77,8 +79,8 @@ class Tree(eqx.Module):
         shape = (self.num_nodes - 1,)
         require(
             self.lengths.shape == shape,
-            f"`lengths` must be one for each branch, {shape}, that of the branch above node i at i − 1; got shape "
-            f"{self.lengths.shape}.",
+            f"`lengths` must be one for each branch, {shape}, that of the branch above node i at "
+            f"i − 1; got shape {self.lengths.shape}.",
         )
         value = concrete(self.lengths)
         if value is None:
@@ -87,8 +89,9 @@ class Tree(eqx.Module):
         if bad.size:
             node = int(bad[0]) + 1
             raise ValueError(
-                f"`lengths` must be finite and at least 0; the branch above {self._in_words(node)} has "
-                f"{value[bad[0]]}. A length of 0 is a node that is where its parent is."
+                "`lengths` must be finite and at least 0; the branch above "
+                f"{self._in_words(node)} has {value[bad[0]]}. A length of 0 is a node that is "
+                "where its parent is."
             )
 
     @classmethod
@@ -101,20 +104,24 @@ class Tree(eqx.Module):
     ) -> "Tree":
         """From nodes in any order.
 
-        **Arguments:** `parents`: for each node the number of its parent, −1 for the root; `lengths`: for each node that
-        of the branch above it, that of the root being ignored; `names`, `observed`: as of the class, by the same
-        numbers.
+        **Arguments:** `parents`: for each node the number of its parent, −1 for the root;
+        `lengths`: for each node that of the branch above it, that of the root being ignored;
+        `names`, `observed`: as of the class, by the same numbers.
         """
         order = _preorder(parents)
         place = {node: i for i, node in enumerate(order)}
         lengths = as_float(lengths, "lengths")
         require(
             lengths.shape == (len(order),),
-            f"`lengths` must be one for each node, ({len(order)},), any number for the root; got shape "
-            f"{lengths.shape}.",
+            f"`lengths` must be one for each node, ({len(order)},), any number for the root; got "
+            f"shape {lengths.shape}.",
         )
         own = _as_names(names, len(order))
-        seen = None if observed is None else [place[node] for node in _as_observed(observed, len(order))]
+        seen = (
+            None
+            if observed is None
+            else [place[node] for node in _as_observed(observed, len(order))]
+        )
         place[-1] = -1
         above = [place[int(parents[node])] for node in order]
         return cls(above, lengths[np.array(order[1:], int)], [own[node] for node in order], seen)
@@ -130,22 +137,25 @@ class Tree(eqx.Module):
     ) -> "Tree":
         """From Newick or NEXUS text, or a file of it.
 
-        Annotations in brackets are skipped, numbers in place of the names of inner nodes are supports and skipped too.
-        A length at the root is time before the first split: the root then has one child.
+        Annotations in brackets are skipped, numbers in place of the names of inner nodes are
+        supports and skipped too. A length at the root is time before the first split: the root then
+        has one child.
 
         **Arguments:**
 
         - `source`: text, or a path.
         - `index`: which of several trees, from 0 on.
-        - `preserve_underscores`: whether `Mus_musculus` without quotes is kept as it is written, or is `Mus musculus`,
-          as the Newick standard has it.
+        - `preserve_underscores`: whether `Mus_musculus` without quotes is kept as it is written, or
+          is `Mus musculus`, as the Newick standard has it.
         - `unit_lengths`: whether every branch has the length 1, whatever is written.
 
-        **Errors:** `ValueError` with line and column of what is no Newick, and for missing and negative lengths, names
-        that are given twice, and several trees without an `index`.
+        **Errors:** `ValueError` with line and column of what is no Newick, and for missing and
+        negative lengths, names that are given twice, and several trees without an `index`.
         """
         flag(unit_lengths, "unit_lengths")
-        parents, lengths, names = parse(source, index, flag(preserve_underscores, "preserve_underscores"))
+        parents, lengths, names = parse(
+            source, index, flag(preserve_underscores, "preserve_underscores")
+        )
         if lengths[0]:  # the process starts before the first split
             parents = [-1, *(parent + 1 for parent in parents)]
             lengths, names = [0.0, *lengths], [None, *names]
@@ -155,20 +165,23 @@ class Tree(eqx.Module):
         missing = [node for node, length in enumerate(lengths) if length is None and node > 0]
         require(
             not missing,
-            f"every branch must have a length, since it is a time; the one above "
-            f"{tree._in_words(missing[0]) if missing else ''} has none, {len(missing)} in all. Write them, or ask for "
-            "`unit_lengths=True`.",
+            "every branch must have a length, since it is a time; the one above "
+            f"{tree._in_words(missing[0]) if missing else ''} has none, {len(missing)} in all. "
+            "Write them, or ask for `unit_lengths=True`.",
         )
         return cls(parents, np.array(lengths[1:], float), names)
 
     @classmethod
     def chain(cls, times: ArrayLike, names: Sequence[str | None] | None = None) -> "Tree":
-        """A time series: nodes one after the other, at `times` `(m,)` since the root, all of them seen."""
+        """A time series: nodes one after the other, at `times` `(m,)` since the root, all of them
+        seen.
+        """
         times = _as_vector(times, "times")
         value = concrete(times)
         require(
             value is None or bool(np.all(np.diff(value, prepend=0.0) >= 0)),
-            f"`times` must not decrease, from 0 at the root on; got {value}. Sort the data by time.",
+            f"`times` must not decrease, from 0 at the root on; got {value}. Sort the data by "
+            "time.",
         )
         count = times.size
         own = None if names is None else [None, *_as_names(names, count)]
@@ -194,7 +207,9 @@ class Tree(eqx.Module):
 
     @property
     def active(self) -> tuple[int, ...]:
-        """Numbers of the nodes but the root that lead to something seen: those whose branches have noise."""
+        """Numbers of the nodes but the root that lead to something seen: those whose branches have
+        noise.
+        """
         return schedule(self.parents, self.observed).active
 
     @property
@@ -207,7 +222,8 @@ class Tree(eqx.Module):
         """For each node the time since the root."""
         depths = jnp.concatenate([jnp.zeros((1,), self.lengths.dtype), self.lengths])
         jump = np.maximum(self.parents, 0)
-        for _ in range(int(np.ceil(np.log2(self.num_nodes)))):  # each time twice as many branches are summed
+        # each time twice as many branches are summed
+        for _ in range(int(np.ceil(np.log2(self.num_nodes)))):
             depths = depths + jnp.where(jump > 0, depths[jump], 0.0)
             jump = jump[jump]
         return depths
@@ -251,28 +267,33 @@ class Tree(eqx.Module):
         return Tree(self.parents, lengths, self.names, self.observed)
 
     def scaled(self, rates: ArrayLike) -> "Tree":
-        """Every length times a rate: one number, or `(num_nodes - 1,)` in the order of `lengths`."""
+        """Every length times a rate: a number, or `(num_nodes - 1,)` in the order of `lengths`."""
         rates = as_float(rates, "rates")
         require(
             rates.shape in ((), self.lengths.shape),
-            f"`rates` must be one number, or one for each branch, {self.lengths.shape}; got shape {rates.shape}. "
-            "`tree.clade(...)` says which branches belong to a clade.",
+            f"`rates` must be one number, or one for each branch, {self.lengths.shape}; got shape "
+            f"{rates.shape}. `tree.clade(...)` says which branches belong to a clade.",
         )
         require(
             jnp.all(jnp.isfinite(rates) & (rates >= 0)),
-            f"`rates` must be finite and at least 0; got {words(concrete(rates))}. Lengths are times.",
+            f"`rates` must be finite and at least 0; got {words(concrete(rates))}. Lengths are "
+            "times.",
         )
         return self.with_lengths(self.lengths * rates)
 
     def clade(self, *names: str, stem: bool = True) -> np.ndarray:
-        """Which branches `(num_nodes - 1,)` lie below the last common ancestor of some nodes, as booleans.
+        """Which branches `(num_nodes - 1,)` lie below the last common ancestor of some nodes, as
+        booleans.
 
         `stem`: whether the branch that leads to the ancestor is one of them.
 
             rates = jnp.where(tree.clade("Papilio ulysses", "Papilio polytes"), fast, slow)
         """
         numbers = [self._number(name) for name in names]
-        require(len(numbers) > 0, "`names` must hold at least one name, of a node in the clade; got none.")
+        require(
+            len(numbers) > 0,
+            "`names` must hold at least one name, of a node in the clade; got none.",
+        )
         ancestor = max(set.intersection(*(set(self._lineage(node)) for node in numbers)))
         first = ancestor if flag(stem, "stem") else ancestor + 1
         nodes = np.arange(1, self.num_nodes)
@@ -280,9 +301,15 @@ class Tree(eqx.Module):
 
     def _number(self, name: str) -> int:
         if not isinstance(name, str) or name not in self.names:
-            near = difflib.get_close_matches(name, self._known_names, n=3) if isinstance(name, str) else []
+            near = (
+                difflib.get_close_matches(name, self._known_names, n=3)
+                if isinstance(name, str)
+                else []
+            )
             hint = f" Near it: {', '.join(map(repr, near))}." if near else ""
-            raise ValueError(f"`names` must be names of nodes of the tree; it has no {words(name)}.{hint}")
+            raise ValueError(
+                f"`names` must be names of nodes of the tree; it has no {words(name)}.{hint}"
+            )
         return self.names.index(name)
 
     @property
@@ -292,18 +319,24 @@ class Tree(eqx.Module):
     def observing(self, names: Iterable[str]) -> "Tree":
         """The same tree of which the nodes of these names are seen, tips, inner nodes or fossils.
 
-        What is not seen costs nothing and says nothing: a tip without data need not be pruned. A name that is given
-        several times is a node of which there are as many rows of data, such as specimens of a species.
+        What is not seen costs nothing and says nothing: a tip without data need not be pruned. A
+        name that is given several times is a node of which there are as many rows of data, such as
+        specimens of a species.
         """
-        return Tree(self.parents, self.lengths, self.names, [self._number(name) for name in _several(names)])
+        return Tree(
+            self.parents, self.lengths, self.names, [self._number(name) for name in _several(names)]
+        )
 
     def pruned(self, names: Iterable[str]) -> "Tree":
-        """The tree of these tips alone: branches that meet without a split become one, of the sum of their lengths."""
+        """The tree of these tips alone: branches that meet without a split become one, of the sum
+        of their lengths.
+        """
         wanted = {self._number(name) for name in _several(names)}
         inner = wanted - set(self.tips)
         require(
             not inner,
-            f"`names` must be those of tips; {', '.join(self._in_words(i) for i in sorted(inner))} is no tip.",
+            f"`names` must be those of tips; {', '.join(self._in_words(i) for i in sorted(inner))} "
+            "is no tip.",
         )
         needed = sorted(set().union(*(self._lineage(node) for node in wanted)))
         children = Counter(self.parents[node] for node in needed[1:])
@@ -312,7 +345,8 @@ class Tree(eqx.Module):
         parents, branches, owners = [-1], [], []
         for node in kept[1:]:
             owner, above = place[node], node
-            while above == node or above not in place:  # the branches down from the kept node before it
+            # the branches down from the kept node before it
+            while above == node or above not in place:
                 branches.append(above - 1)
                 owners.append(owner - 1)
                 above = self.parents[above]
@@ -322,30 +356,35 @@ class Tree(eqx.Module):
         return Tree(parents, lengths, [self.names[node] for node in kept])
 
     def num_steps(self, longest: float, multiple: int = 2) -> tuple[int, ...]:
-        """How many steps of equal length each branch needs so that none is longer, for `DiffusionTree(num_steps=)`.
+        """How many steps of equal length each branch needs so that none is longer, for
+        `DiffusionTree(num_steps=)`.
 
-        Numbers are multiples of `multiple`: branches are led in pieces of that many steps, and fewer pieces are faster.
+        Numbers are multiples of `multiple`: branches are led in pieces of that many steps, and
+        fewer pieces are faster.
         """
         longest = known_number(longest, "longest", "a positive number", lambda value: value > 0)
         multiple = positive_integer(multiple, "multiple")
         lengths = concrete(self.lengths)
         if lengths is None:
             raise ValueError(
-                "`tree` must have lengths that are known, since programs have fixed numbers of steps; these are "
-                "traced. Count the steps outside of the model, on a tree of typical lengths."
+                "`tree` must have lengths that are known, since programs have fixed numbers of "
+                "steps; these are traced. Count the steps outside of the model, on a tree of "
+                "typical lengths."
             )
         pieces = np.ceil(lengths / (multiple * longest) * (1 - 1e-9))  # not one more for rounding
         return tuple(int(multiple * max(count, 1)) for count in pieces)
 
     def divided(self, pieces: Sequence[int]) -> "Tree":
-        """The same tree with its branches divided into equal pieces, `(num_nodes - 1,)` numbers of them.
+        """The same tree with its branches divided into equal pieces, `(num_nodes - 1,)` numbers of
+        them.
 
         The nodes between are not seen and have no names. Node i becomes node `sum(pieces[:i])`.
         """
         counts = np.array(positive_integers(pieces, "pieces", self.num_nodes - 1, "branches"))
         place = np.concatenate([[0], np.cumsum(counts)])
         parents = np.arange(-1, place[-1])  # a piece begins where the one before it ends
-        parents[1 + place[:-1]] = place[np.array(self.parents[1:], int)]  # or, the first, where the branch does
+        # or, the first, where the branch does
+        parents[1 + place[:-1]] = place[np.array(self.parents[1:], int)]
         names: list[str | None] = [None] * len(parents)
         for node, name in enumerate(self.names):
             names[place[node]] = name
@@ -362,18 +401,18 @@ class Tree(eqx.Module):
 
         Rows of one node keep the order in which they were given.
 
-        **Arguments:** `data`: `Specimen`s, by their `id`, or an array `(m, ...)` with its `names`; or arrays by name,
-        that of a node with several rows having an axis of them in front.
+        **Arguments:** `data`: `Specimen`s, by their `id`, or an array `(m, ...)` with its `names`;
+        or arrays by name, that of a node with several rows having an axis of them in front.
 
-        **Errors:** `ValueError` that lists the seen nodes without data, the data without a node and near spellings, and
-        for other numbers of rows than `observed` has, and shapes that differ.
+        **Errors:** `ValueError` that lists the seen nodes without data, the data without a node and
+        near spellings, and for other numbers of rows than `observed` has, and shapes that differ.
         """
         unnamed = [node for node in self.observed if self.names[node] is None]
         require(
             not unnamed,
-            f"the seen nodes must have names to find their data by; "
-            f"{self._in_words(unnamed[0]) if unnamed else ''} has none. Give the tree `names`, or arrange the rows by "
-            "`tree.observed` yourself.",
+            "the seen nodes must have names to find their data by; "
+            f"{self._in_words(unnamed[0]) if unnamed else ''} has none. Give the tree `names`, or "
+            "arrange the rows by `tree.observed` yourself.",
         )
         seen = Counter(name for name in self.observed_names if name is not None)
         rows = _by_name(data, names, seen)
@@ -381,8 +420,9 @@ class Tree(eqx.Module):
         for name, count in seen.items():
             require(
                 len(rows[name]) == count,
-                f"the data have {len(rows[name])} rows of {name!r}, which the tree sees {count} times. "
-                "`tree.observing(names)`, with a name for each row, makes several rows of a node; or average them.",
+                f"the data have {len(rows[name])} rows of {name!r}, which the tree sees {count} "
+                "times. `tree.observing(names)`, with a name for each row, makes several rows of "
+                "a node; or average them.",
             )
         named = [(name, known_float(row, f"data['{name}']")) for name in seen for row in rows[name]]
         values = [value for _, value in named]
@@ -399,7 +439,8 @@ def _as_vector(values: ArrayLike, name: str) -> Array:
     array = as_float(values, name)
     require(
         array.ndim == 1 and array.size > 0,
-        f"`{name}` must be a vector, one number for each node but the root; got shape {array.shape}.",
+        f"`{name}` must be a vector, one number for each node but the root; got shape "
+        f"{array.shape}.",
     )
     return array
 
@@ -409,24 +450,28 @@ def _as_parents(parents: Sequence[int]) -> tuple[int, ...]:
     numbers = _preorder(parents)
     require(
         numbers == list(range(len(numbers))),
-        "`parents` must be in preorder: the root first, each subtree in one block. `Tree.from_parents` takes nodes in "
-        "any order.",
+        "`parents` must be in preorder: the root first, each subtree in one block. "
+        "`Tree.from_parents` takes nodes in any order.",
     )
     return tuple(int(parent) for parent in parents)
 
 
 def _preorder(parents: Sequence[int]) -> list[int]:
-    """Numbers of the nodes, the root first and children in their order; `ValueError` for what is no tree."""
+    """Numbers of the nodes, the root first and children in their order; `ValueError` for what is no
+    tree.
+    """
     array = known_float(parents, "parents")
     count = array.size
     require(
         array.ndim == 1 and count > 1,
-        f"`parents` must be a vector, the number of the parent of each of at least two nodes; got {words(parents)}.",
+        "`parents` must be a vector, the number of the parent of each of at least two nodes; got "
+        f"{words(parents)}.",
     )
     whole = (array == np.round(array)) & (array >= -1) & (array < count)
     require(
         bool(whole.all()),
-        f"`parents` must be numbers of nodes, from 0 to {count - 1}, or −1 for the root; got {array[~whole][:5]}.",
+        f"`parents` must be numbers of nodes, from 0 to {count - 1}, or −1 for the root; got "
+        f"{array[~whole][:5]}.",
     )
     numbers = array.astype(int)
     roots = np.flatnonzero(numbers == -1)
@@ -441,7 +486,9 @@ def _preorder(parents: Sequence[int]) -> list[int]:
         order.append(node)
         waiting.extend(reversed(children[node]))
     lost = sorted(set(range(count)) - set(order))
-    require(not lost, f"`parents` must lead to the root; those of the nodes {lost[:5]} run in a circle.")
+    require(
+        not lost, f"`parents` must lead to the root; those of the nodes {lost[:5]} run in a circle."
+    )
     return order
 
 
@@ -452,12 +499,16 @@ def _as_names(names: Sequence[str | None] | None, count: int) -> tuple[str | Non
     own = tuple(names) if several else ()
     require(
         len(own) == count,
-        f"`names` must be one for each of {count} nodes, None where there is none; got {words(names)}.",
+        f"`names` must be one for each of {count} nodes, None where there is none; got "
+        f"{words(names)}.",
     )
     bad = [name for name in own if not (name is None or isinstance(name, str))]
     require(not bad, f"`names` must be texts, or None; got {words(bad[0]) if bad else ''}.")
     twice = [name for name, number in Counter(own).items() if number > 1 and name is not None]
-    require(not twice, f"`names` must differ; {', '.join(map(repr, twice[:5]))} is given more than once.")
+    require(
+        not twice,
+        f"`names` must differ; {', '.join(map(repr, twice[:5]))} is given more than once.",
+    )
     return own
 
 
@@ -483,16 +534,22 @@ def _by_name(data, names, seen: Counter[str]) -> dict[str, list]:
     """The rows of each name."""
     if isinstance(data, Mapping):
         require(names is None, "`names` belong to an array; `data` is a mapping by name.")
-        return {name: _rows_of(data[name], name) if seen[name] > 1 else [data[name]] for name in data}
+        return {
+            name: _rows_of(data[name], name) if seen[name] > 1 else [data[name]] for name in data
+        }
     if names is None:
         specimens = list(data) if isinstance(data, Iterable) else []
         for i, specimen in enumerate(specimens):
             require_instance(specimen, Named, f"data[{i}]", "a `Specimen`; an array needs `names=`")
         require(
             len(specimens) > 0,
-            f"`data` must be arrays by name, `Specimen`s, or an array with `names=`; got {words(data)}.",
+            "`data` must be arrays by name, `Specimen`s, or an array with `names=`; got "
+            f"{words(data)}.",
         )
-        names, data = [specimen.id for specimen in specimens], [specimen.landmarks for specimen in specimens]
+        names, data = (
+            [specimen.id for specimen in specimens],
+            [specimen.landmarks for specimen in specimens],
+        )
     names = _several(names)
     data = data if isinstance(data, list) else known_float(data, "data")
     require(
@@ -509,8 +566,8 @@ def _rows_of(value, name: str) -> list:
     array = known_float(value, f"data['{name}']")
     require(
         array.ndim > 0,
-        f"`data['{name}']` must have an axis of rows in front, since the tree sees this node several times; got "
-        f"{words(value)}.",
+        f"`data['{name}']` must have an axis of rows in front, since the tree sees this node "
+        f"several times; got {words(value)}.",
     )
     return list(array)
 
@@ -528,7 +585,10 @@ def _difference(seen: list[str], given: list[str]) -> str:
     if pairs:
         lines.append(f"Perhaps {', '.join(pairs)}?")
     if any(name.replace(" ", "_") in without for name in unknown):
-        lines.append("The tree keeps underscores: `Tree.from_newick(..., preserve_underscores=False)` reads blanks.")
+        lines.append(
+            "The tree keeps underscores: `Tree.from_newick(..., preserve_underscores=False)` reads "
+            "blanks."
+        )
     if without and not unknown:
         lines.append("Tips without data are left out by `tree.observing(data)`.")
     return " ".join(lines)
