@@ -1,8 +1,8 @@
 """How good is a guide? Spread of the log weight, evidence and time, for each guide on simulated,
 real and small cases.
 
-    python benchmarks/guides.py [--quick] [--particles 2000] [--cases kunita wing butterflies cell
-    gbm rounds]
+    python benchmarks/guides.py [--quick] [--particles 2000]
+                                [--cases kunita wing butterflies cell gbm rounds]
 
 One JSON line per case and guide: mean and SD of the log weight, log evidence and its standard
 error, ESS in percent, k̂ and whether the evidence is to be trusted, seconds of a run without

@@ -5,11 +5,11 @@ specimen, and eight, on 50 to 400 time steps. JSON lines: bulk ESS of the worse 
 ratio to NUTS in the same run; compile and run time apart. Where R-hat is not below 1.01 in time,
 `converged` is false, and the figures are not to be trusted.
 
-    python benchmarks/mcmc.py                     # hours python benchmarks/mcmc.py --quick
-    # a minute, to see that all runs python benchmarks/mcmc.py --steps 100 --specimens 1 --kernels
-    nuts function-space-hmc python benchmarks/mcmc.py --chains-cost       # four vectorised chains
-    against one python benchmarks/mcmc.py --mesh mesh.png     # acceptance at a fixed step, on finer
-    and finer grids
+    python benchmarks/mcmc.py                     # hours
+    python benchmarks/mcmc.py --quick             # a minute, to see that all runs
+    python benchmarks/mcmc.py --steps 100 --specimens 1 --kernels nuts function-space-hmc
+    python benchmarks/mcmc.py --chains-cost       # four vectorised chains against one
+    python benchmarks/mcmc.py --mesh mesh.png     # acceptance at a fixed step, on finer grids
 """
 
 import argparse

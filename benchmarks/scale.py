@@ -1,7 +1,7 @@
 """What does a guided weight cost as the number of landmarks grows, beside noise of all landmarks?
 
-    python benchmarks/scale.py [--sizes 32 128 1000] [--length-scales 0.4 0.1] [--guides
-    GeodesicGuide]
+    python benchmarks/scale.py [--sizes 32 128 1000] [--length-scales 0.4 0.1]
+                               [--guides GeodesicGuide]
 
 One path of 100 steps between two outlines of diameter 2.5, controls by a tolerance of 1e-3, one
 core: value, and gradient with respect to the noise, the amplitude and the length scale. A JSON line

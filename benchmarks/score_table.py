@@ -1,12 +1,11 @@
 """How well is the score of Brownian motion between shapes learned, and how fast, beside the
 published recipe?
 
-    python benchmarks/score_table.py [--quick] [--cells landmarks-8 fourier-32] [--conditions exact
-    inexact]
-                                     [--methods reversal adjoint residual] [--epochs 10] [--output
-                                     DIR]
-    python benchmarks/score_table.py --freeze FILE [--budget SECONDS]     the reference's curves
-    alone
+    python benchmarks/score_table.py [--quick] [--cells landmarks-8 fourier-32]
+                                     [--conditions exact inexact]
+                                     [--methods reversal adjoint residual]
+                                     [--epochs 10] [--output DIR]
+    python benchmarks/score_table.py --freeze FILE [--budget SECONDS]    # the reference's curves
 
 The published table (Baker, Yang, Severinsen, Hipsley and Sommer 2024): the unit circle is start and
 target, T = 1, dX = 0.1 dW in every coordinate, 100 steps of one length. N landmarks, or the 2N + 1

@@ -1,7 +1,8 @@
 """Inference on trees beside hyperiax 3.0, on the two trees of its notebooks.
 
-    pip install ".[benchmarks]" python benchmarks/trees_against_hyperiax.py [--quick] [--parts
-    gaussian weight kunita] [--iterations 2000]
+    pip install ".[benchmarks]"
+    python benchmarks/trees_against_hyperiax.py [--quick] [--parts gaussian weight kunita]
+                                                [--iterations 2000]
 
 `gaussian`: a binary tree of 16 leaves, Brownian motion, two variances with priors: NUTS by both,
 beside a grid. `weight`: a Kunita flow of 16 landmarks on a ternary tree of 9 leaves, 100 steps a

@@ -6,10 +6,10 @@
 # The paper learns every score from nothing; here a learned score corrects a guided bridge, weights
 # make it exact, and ESS and k̂ say how good it is.
 #
-#     python examples/conditioning_paper.py                                     # mosquito wings,
-#     all figures python examples/conditioning_paper.py --figures bridge --start a.csv --end b.csv
+#     python examples/conditioning_paper.py            # mosquito wings, all figures
+#     python examples/conditioning_paper.py --quick    # some two minutes
+#     python examples/conditioning_paper.py --figures bridge --start a.csv --end b.csv
 #     python examples/conditioning_paper.py --figures species --specimens all.csv --labels table.csv
-#     python examples/conditioning_paper.py --quick                             # some two minutes
 #
 # Files: tps or CSV, any number of points, the same in all files, row i being the same place on each
 # shape. Shapes are aligned, and drawn in units of the start's larger extent: a kernel of width 0.1

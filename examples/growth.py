@@ -7,9 +7,9 @@
 # has an error. An age at which an animal was not measured is masked; its shape there is among the
 # results.
 #
-#     python examples/growth.py                                             # simulated animals, and
-#     the truth beside python examples/growth.py --shapes rats.csv --names rat --age age_days python
-#     examples/growth.py --quick                                     # under a minute
+#     python examples/growth.py            # simulated animals, and the truth beside
+#     python examples/growth.py --quick    # under a minute
+#     python examples/growth.py --shapes rats.csv --names rat --age age_days
 
 # %%
 import time

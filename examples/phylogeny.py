@@ -7,12 +7,13 @@
 # parameter too. MCMC draws from the posterior of these three and of the paths along the branches,
 # whose ends are the ancestors.
 #
-#     python examples/phylogeny.py --shapes wings.tps --tree tree.nwk                      # ID= is
-#     the species python examples/phylogeny.py --shapes wings.csv --names species --tree tree.nex
-#     python examples/phylogeny.py --shapes wings.tps --table specimens.csv --by specimen --names
-#     tip --tree tree.nwk python examples/phylogeny.py ... --quick       # under a minute, to see
-#     that all runs python examples/phylogeny.py ... --run saved   # saved as it goes; after a kill
-#     the same line goes on from there
+#     python examples/phylogeny.py --shapes wings.tps --tree tree.nwk    # ID= is the species
+#     python examples/phylogeny.py --shapes wings.csv --names species --tree tree.nex
+#     python examples/phylogeny.py --shapes wings.tps --table specimens.csv --by specimen \
+#         --names tip --tree tree.nwk
+#     python examples/phylogeny.py ... --quick       # under a minute, to see that all runs
+#     python examples/phylogeny.py ... --run saved   # saved as it goes; after a kill the same line
+#                                                    # goes on from there
 #
 # Shapes come in a tps or CSV file, row i being the same place on each; names are those of the tree,
 # in Newick or NEXUS. A species without a shape is left out of the tree, a shape without its tip is
