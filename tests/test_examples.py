@@ -65,6 +65,20 @@ def test_first_page(tmp_path):
     assert abs(float(log_weight) - float(log_evidence)) < 10
 
 
+def test_first_bridge(tmp_path):
+    """Its own referee agrees with it: a density by quadrature."""
+    pytest.importorskip("matplotlib")
+    script = str(ROOT / "examples/first_bridge.py")
+    out = run(script, "--quick", "--output", "output", cwd=tmp_path)
+    away, error = (
+        float(re.search(pattern, out).group(1))
+        for pattern in (r"([\d.]+) standard errors away", r"log density of the end: .* ± ([\d.]+)")
+    )
+    assert away < 4 and error < 0.1 and "r_hat" in out
+    names = ("first_bridge.nc", "first_bridge.png", "first_bridge_posterior.png")
+    require_written(tmp_path, *names)
+
+
 def test_mosquito_wings(tmp_path):
     pytest.importorskip("ktch")
     pytest.importorskip("matplotlib")
