@@ -166,7 +166,7 @@ figure.savefig(written[1], dpi=150)
 plt.close()
 
 nb.plot.posterior({name: posterior[name] for name in TRUTH}, prior, truth=TRUTH)
-plt.gcf().suptitle("posterior, prior (broken), truth", fontsize="medium")
+plt.gcf().suptitle("posterior, prior (dashed), truth", fontsize="medium")
 plt.savefig(written[2], dpi=150)
 plt.close()
 print("written: " + ", ".join(str(path) for path in written))

@@ -41,7 +41,7 @@ parser.add_argument("--quick", action="store_true", help="fewer paths and draws"
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--output", type=Path, default=Path("output"))
 arguments = parser.parse_known_args()[0]
-num_paths = 512 if arguments.quick else 4096
+num_paths = 2048 if arguments.quick else 4096
 num_warmup, num_samples = (100, 200) if arguments.quick else (300, 1000)
 TRUTH = {"theta": 2.0, "sigma": 1.0}
 START, END = np.array([1.0]), np.array([-1.0])

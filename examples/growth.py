@@ -215,7 +215,7 @@ plt.close()
 nb.plot.posterior(
     {name: posterior[name] for name in prior}, prior, truth=None if arguments.shapes else TRUTH
 )
-plt.gcf().suptitle("posterior, and prior (broken)", fontsize="medium")
+plt.gcf().suptitle("posterior, and prior (dashed)", fontsize="medium")
 plt.savefig(written[2], dpi=150)
 plt.close()
 print("written: " + ", ".join(str(path) for path in written))

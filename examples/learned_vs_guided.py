@@ -302,7 +302,7 @@ for ax, values in zip(axes, runs["learned"][0].values(), strict=True):
     )
     ax.plot(grid, density, color="#d55e00", linewidth=1.4, linestyle=(0, (4, 2)))
 plt.gcf().suptitle(
-    "posterior with the guide alone (filled) and with the learned one (broken)", fontsize="medium"
+    "posterior with the guide alone (filled) and with the learned one (dashed)", fontsize="medium"
 )
 plt.savefig(arguments.output / "posteriors.png", dpi=150)
 plt.close()

@@ -6,8 +6,15 @@
 # seen with a small observation error. MCMC draws from the posterior of (α, ℓ) and of the paths
 # themselves, for all specimens of the genus.
 #
-#     python examples/mosquito_wings.py            # 4 chains, some minutes on 2 cores
-#     python examples/mosquito_wings.py --quick    # under a minute, to see that all runs
+#     python examples/mosquito_wings.py                # 4 chains, some minutes on 2 cores
+#     python examples/mosquito_wings.py --quick        # under a minute, to see that all runs
+#     python examples/mosquito_wings.py --genus Aedes  # or its code, AE
+#     python examples/mosquito_wings.py --shapes wings.tps                           # your file
+#     python examples/mosquito_wings.py --shapes wings.tps --groups specimens.csv \
+#         --by specimen --column species --group "Papilio polytes"
+#
+# A file of your own holds the shapes of one group, or of several: then a table says which group
+# each specimen is of, and the group to be fitted is chosen.
 
 # %%
 import argparse
@@ -25,6 +32,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from numpyro.infer import MCMC, Predictive
+from phylogeny import column_of, read_shapes
 
 import numpyro_bridges as nb
 
@@ -34,7 +42,14 @@ parser = argparse.ArgumentParser()
 parser.add_argument(
     "--quick", action="store_true", help="4 specimens, 16 points, few steps and draws"
 )
-parser.add_argument("--genus", default="CX", help="a genus of the data set; CX is Culex")
+parser.add_argument("--genus", default="Culex", help="of the data set: a name or a code, CX")
+parser.add_argument("--shapes", type=Path, help="a file of your own that `io.read` reads")
+parser.add_argument("--groups", type=Path, dest="table", help="a table with a row a specimen")
+parser.add_argument("--by", help="its column with the ids; without it, row is for row")
+parser.add_argument("--column", help="the column with the group, of that table or of the shapes")
+parser.add_argument("--group", help="the group to be fitted; without it, all specimens")
+parser.add_argument("--points", type=int, help="landmarks, at equal steps of their number")
+parser.add_argument("--open", action="store_true", help="curves whose ends do not meet")
 parser.add_argument("--specimens", type=int, help="the first so many; by default all")
 parser.add_argument("--warmup", type=int, default=150)
 parser.add_argument("--samples", type=int, default=300)
@@ -42,22 +57,47 @@ parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--output", type=Path, default=Path("output"))
 arguments, _ = parser.parse_known_args()
 quick = arguments.quick
-num_points, num_steps = (16, 10) if quick else (32, 50)
+arguments.points = min(arguments.points or 32, 16 if quick else 1000)
+num_steps = 10 if quick else 50
 num_warmup, num_samples = (30, 50) if quick else (arguments.warmup, arguments.samples)
 
 # %% [markdown]
 # ## The data
 # Real outlines, resampled by arc length, aligned, at unit RMS radius; the observation error is
-# small beside their spread.
+# small beside their spread. Shapes of your own are aligned here too, and mirror images are named.
+
 
 # %%
-wings = nb.datasets.mosquito_wings(num_points=num_points, genus=arguments.genus)
-points = wings.points[: 4 if quick else arguments.specimens]
+def own_shapes():
+    """Aligned shapes of the chosen group, their mean, and what to call them."""
+    shapes, rows = read_shapes(arguments)
+    if arguments.group is not None:
+        groups = column_of(rows, arguments.column, "--column")
+        if arguments.group not in groups:
+            known = sorted(set(groups))
+            raise ValueError(f"--group must be one of {known}; got {arguments.group!r}.")
+        shapes = shapes[[group == arguments.group for group in groups]]
+    if np.isnan(shapes).any():
+        raise ValueError("--shapes must be complete here: `InexactMatch(mask=)` takes others.")
+    alignment = nb.shapes.procrustes_align(shapes)
+    return alignment.shapes, alignment.mean, arguments.group or arguments.shapes.name
+
+
+if arguments.shapes is None:
+    wings = nb.datasets.mosquito_wings(num_points=arguments.points, genus=arguments.genus)
+    points, mean, label = wings.points, wings.mean, arguments.genus
+else:
+    try:
+        points, mean, label = own_shapes()
+    except (OSError, ValueError) as problem:
+        parser.error(str(problem))
+points = points[: 4 if quick else arguments.specimens]
+num_points = len(mean)
 space = nb.Landmarks(num_points=num_points, dim=2)
 seen = nb.InexactMatch.from_point_sd(0.005, space)
-spread = float(np.std(points - wings.mean))
+spread = float(np.std(points - mean))
 print(
-    f"{len(points)} wings of {arguments.genus}, {num_points} points: spread of a coordinate "
+    f"{len(points)} shapes of {label}, {num_points} points: spread of a coordinate "
     f"{spread:.4f},",
     end=" ",
 )
@@ -73,7 +113,7 @@ def model(observed=None, num_specimens=None):
     amplitude = numpyro.sample("amplitude", dist.LogNormal(-2.0, 1.0))
     length_scale = numpyro.sample("length_scale", dist.LogNormal(-1.0, 0.5))
     flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale))
-    law = nb.DiffusionEndpoint(flow, wings.mean, seen, t1=1.0, num_steps=num_steps)
+    law = nb.DiffusionEndpoint(flow, mean, seen, t1=1.0, num_steps=num_steps)
     with numpyro.plate("specimen", num_specimens or len(points)):
         nb.sample("wing", law, obs=observed)
 
@@ -114,14 +154,14 @@ print(f"divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
 @jax.jit
 def bridge_path(amplitude, length_scale, noise, observed):
     flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale))
-    bridge = nb.GuidedBridge(flow, seen.at(observed), x0=wings.mean, t1=1.0, num_steps=num_steps)
+    bridge = nb.GuidedBridge(flow, seen.at(observed), x0=mean, t1=1.0, num_steps=num_steps)
     # a ∇log h̃, what is added to the drift
     pull = flow.covariance(0.0, bridge.x0) @ bridge.score(0.0, bridge.x0)
     return bridge.path(noise), pull
 
 
 # the wing farthest from the mean
-specimen = int(np.argmax(np.std(points - wings.mean, axis=(1, 2))))
+specimen = int(np.argmax(np.std(points - mean, axis=(1, 2))))
 chosen = np.linspace(0, len(posterior["amplitude"]) - 1, 40).astype(int)
 paths, pulls = jax.vmap(bridge_path, (0, 0, 0, None))(
     posterior["amplitude"][chosen],
@@ -152,16 +192,22 @@ def save(name, title):
 
 
 def magnified(shapes, times=4):
-    return wings.mean + times * (np.asarray(shapes) - wings.mean)
+    return mean + times * (np.asarray(shapes) - mean)
 
 
-nb.plot.bridge_fan(magnified(paths), wings.mean, magnified(points[specimen]), direction="column")
+nb.plot.bridge_fan(
+    magnified(paths),
+    mean,
+    magnified(points[specimen]),
+    direction="column",
+    closed=not arguments.open,
+)
 save("bridges.png", "posterior bridges, deviations × 4")
 
 nb.plot.posterior({k: posterior[k] for k in ("amplitude", "length_scale")}, prior)
-save("posterior.png", "posterior, and prior (broken)")
+save("posterior.png", "posterior, and prior (dashed)")
 
-nb.plot.score_field(wings.mean, np.asarray(pulls).mean(0))
+nb.plot.score_field(mean, np.asarray(pulls).mean(0), closed=not arguments.open)
 save("score.png", "guiding term at the start, a ∇log h")
 
 print("written: " + ", ".join(str(path) for path in written))

@@ -319,7 +319,7 @@ def save(data, samples, prior, results, arguments, name):
     plt.savefig(written[1], dpi=150)
     plt.close()
     nb.plot.posterior({name: np.ravel(values) for name, values in samples.items()}, prior)
-    plt.gcf().suptitle("posterior, and prior (broken)", fontsize="medium")
+    plt.gcf().suptitle("posterior, and prior (dashed)", fontsize="medium")
     plt.savefig(written[2], dpi=150)
     plt.close()
     print("written: " + ", ".join(str(path) for path in written))

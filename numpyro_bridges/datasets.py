@@ -38,12 +38,29 @@ class Shapes:
     names: tuple[str, ...]
 
 
+GENERA = {
+    "AE": "Aedes",
+    "AN": "Anopheles",
+    "CA": "Culiseta",
+    "CX": "Culex",
+    "DE": "Deinocerites",
+    "MA": "Mansonia",
+    "OR": "Orthopodomyia",
+    "PS": "Psorophora",
+    "TO": "Toxorhynchites",
+    "UR": "Uranotaenia",
+    "WY": "Wyeomyia",
+}
+"""Names of the genera by the codes of the source, which gives these alone."""
+
+
 def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
     """Outlines of mosquito wings (Rohlf & Archie 1984), from the package `ktch`.
 
-    126 specimens: 57 of genus `"AE"`, 25 of `"CX"`, 12 of `"PS"`, 11 of `"AN"`, 7 of `"CA"`, 4 of
-    `"UR"`, 4 of `"WY"`, 3 of `"MA"`, 1 each of `"DE"`, `"OR"`, `"TO"` (the source's codes: *Aedes*,
-    *Culex*, ...).
+    126 specimens. By the source's codes of the genera: 57 of `AE`, *Aedes*; 25 of `CX`, *Culex*; 12
+    of `PS`, *Psorophora*; 11 of `AN`, *Anopheles*; 7 of `CA`, *Culiseta*; 4 each of `UR`,
+    *Uranotaenia*, and `WY`, *Wyeomyia*; 3 of `MA`, *Mansonia*; 1 each of `DE`, *Deinocerites*,
+    `OR`, *Orthopodomyia*, and `TO`, *Toxorhynchites*.
 
     The source gives 100 points of each outline at equal polar angles, which crowds them in the
     middle of a long wing; here they are at equal arc length. The first point of every outline is
@@ -54,7 +71,7 @@ def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
     **Arguments:**
 
     - `num_points`: of each outline, at least 3. More than about 100 only interpolate the source.
-    - `genus`: a code from above; all genera without it.
+    - `genus`: a code or a name from above; all genera without it.
 
     **Returns:** `Shapes`; labels are genera, names such as `"CX 103"` hold the source's number.
 
@@ -64,10 +81,15 @@ def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
     folder = _ktch_data() / "outline_mosquito_wings"
     with open(folder / "meta_outline_mosquito_wings.csv", encoding="utf-8", newline="") as file:
         genera = {row["specimen_id"]: row["genus"] for row in csv.DictReader(file)}
-    chosen = [specimen for specimen, its in genera.items() if genus is None or str(genus) == its]
+    chosen = [
+        specimen
+        for specimen, code in genera.items()
+        if genus is None or str(genus) in (code, GENERA[code])
+    ]
     if not chosen:
         available = ", ".join(
-            f"{name!r} ({count})" for name, count in Counter(genera.values()).most_common()
+            f"{code!r}, {GENERA[code]} ({count})"
+            for code, count in Counter(genera.values()).most_common()
         )
         raise ValueError(
             f"`genus` must be one of {available}, or None for all; got {words(genus)}."

@@ -59,20 +59,28 @@ def test_wings_start_at_the_hinge_and_lie_along_x():
 @needs_ktch
 def test_wings_by_genus_are_counted_as_the_docstring_says():
     counts = Counter(datasets.mosquito_wings(num_points=3).labels)
-    for genus, count in counts.items():
-        plural = {1: "1 each of", 57: f'{count} of genus `"{genus}"`'}.get(
-            count, f'{count} of `"{genus}"`'
-        )
-        assert plural in " ".join(datasets.mosquito_wings.__doc__.split())
-    assert [genus for genus, count in counts.items() if count == 1] == ["TO", "OR", "DE"]
+    said = " ".join(datasets.mosquito_wings.__doc__.split())
+    for code, count in counts.items():
+        assert f"`{code}`, *{datasets.GENERA[code]}*" in said
+        assert f"{count} of `{code}`" in said or list(counts.values()).count(count) > 1
+    assert "4 each of `UR`" in said and counts["UR"] == counts["WY"] == 4
+    assert "1 each of `DE`" in said
+    assert [code for code, count in counts.items() if count == 1] == ["TO", "OR", "DE"]
 
 
 @needs_ktch
 def test_unknown_genus_lists_the_known_ones():
     with pytest.raises(
-        ValueError, match=r"`genus` must be one of 'AE' \(57\), 'CX' \(25\), .*; got 'Culex'"
+        ValueError,
+        match=r"`genus` must be one of 'AE', Aedes \(57\), 'CX', Culex \(25\), .*; got 'Culix'",
     ):
-        datasets.mosquito_wings(genus="Culex")
+        datasets.mosquito_wings(genus="Culix")
+
+
+@needs_ktch
+def test_a_genus_has_a_name_and_a_code():
+    named, coded = (datasets.mosquito_wings(num_points=8, genus=g) for g in ("Wyeomyia", "WY"))
+    assert named.names == coded.names and len(named.names) == 4
 
 
 @needs_ktch

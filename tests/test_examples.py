@@ -79,6 +79,27 @@ def test_first_bridge(tmp_path):
     require_written(tmp_path, *names)
 
 
+@pytest.mark.parametrize(
+    "file",
+    ["papilio/papilio_raw_10.tps", pytest.param("tyrannus/tyrannus.tps", marks=pytest.mark.slow)],
+)
+def test_from_a_file_to_a_posterior(file, shared_data, tmp_path):
+    """The page's fifteen lines, on shapes that others digitised."""
+    page = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
+    (block,) = (
+        found for found in re.findall(r"```python\n(.*?)```", page, re.S) if "print_summary" in found
+    )
+    _, block = block.split("ellipse in ellipses.points])\n")
+    lines = [line for line in block.splitlines() if line.strip()]
+    assert len(lines) <= 15
+    block = block.replace("shapes.tps", str(shared_data / file))
+    block = block.replace("num_warmup=100, num_samples=100", "num_warmup=10, num_samples=10")
+    imports = page[page.index("import jax\nimport numpyro\n") :].partition("\n\nellipses")[0]
+    (tmp_path / "page.py").write_text(f"{imports}\n{block}")
+    out = run("page.py", cwd=tmp_path)
+    assert "amplitude" in out and "length_scale" in out and "nan" not in out
+
+
 def test_mosquito_wings(tmp_path):
     pytest.importorskip("ktch")
     pytest.importorskip("matplotlib")
@@ -87,6 +108,31 @@ def test_mosquito_wings(tmp_path):
     )
     assert "r_hat" in out and "divergences: 0" in out
     require_written(tmp_path, "wings.nc", "bridges.png", "posterior.png", "score.png")
+
+
+@pytest.mark.slow
+def test_mosquito_wings_reads_files(tmp_path):
+    pytest.importorskip("matplotlib")
+    rng = np.random.default_rng(0)
+    ellipses = nb.datasets.ellipses(num_points=16, aspects=(1.0, 1.2, 1.4)).points
+    shapes = [ellipses[i % 3] + 0.02 * rng.normal(size=(16, 2)) for i in range(6)]
+    specimens = [nb.io.Specimen(shape, id=str(i)) for i, shape in enumerate(shapes)]
+    nb.io.write_tps(tmp_path / "shapes.tps", specimens)
+    (tmp_path / "groups.csv").write_text("species\n" + "\n".join("ababab"))
+    script = str(ROOT / "examples/mosquito_wings.py")
+    chosen = "--shapes shapes.tps --groups groups.csv --column species --group a".split()
+    out = run(script, *chosen, "--quick", "--output", "output", cwd=tmp_path)
+    assert "3 shapes of a, 16 points" in out and "r_hat" in out
+    require_written(tmp_path, "wings.nc", "bridges.png", "posterior.png", "score.png")
+    done = subprocess.run(
+        [sys.executable, script, *chosen[:-1], "c"],
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 2 and "--group must be one of ['a', 'b']; got 'c'" in done.stderr
 
 
 def test_phylogeny_reads_files(tmp_path):
@@ -154,6 +200,18 @@ def test_phylogeny_prepares_data_and_says_what_is_wrong(tmp_path):
     assert "--names must be a column that every specimen has filled, one of []; got 'id'" in said[0]
     assert "'Alpha'" in said[1] and "alpha" in said[1]
     assert "no.csv" in said[2] and "no.nwk" in said[3]
+
+
+@pytest.mark.slow
+def test_comparing_models(tmp_path):
+    """Its own referee agrees with it: two evidences by quadrature."""
+    pytest.importorskip("matplotlib")
+    script = str(ROOT / "examples/comparing_models.py")
+    out = run(script, "--quick", "--output", "output", cwd=tmp_path)
+    away = [float(errors) for errors in re.findall(r"([\d.]+) standard errors away", out)]
+    assert len(away) == 2 and max(away) < 6  # of four islands: Student's t, 3 degrees of freedom
+    assert float(re.search(r"probability of “wanders”: ([\d.]+)", out).group(1)) < 0.2
+    require_written(tmp_path, "comparing_models.png")
 
 
 @pytest.mark.slow

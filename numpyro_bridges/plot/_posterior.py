@@ -18,7 +18,7 @@ def posterior(
     truth: Mapping[str, float] | None = None,
     level: float = 0.9,
 ) -> list:
-    """Marginal densities of scalar parameters: posterior filled, prior as a broken line.
+    """Marginal densities of scalar parameters: posterior filled, prior as a dashed line.
 
     Densities are Gaussian kernel estimates, reflected at zero where every draw is positive. A bar
     marks the central interval, a dot the median; the prior is shown over its central 80 %.
