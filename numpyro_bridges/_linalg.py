@@ -156,7 +156,7 @@ def filled(S: Structured, empty: Array) -> Structured:
 
 
 def symmetric(S: Structured) -> Structured:
-    """½ (S + Sᵀ): a factorisation has derivatives for symmetric matrices, and a parameter is any."""
+    """½ (S + Sᵀ): a factorisation has derivatives for symmetric matrices; a parameter is any."""
     return 0.5 * (S + S.T) if S.ndim == 2 else S
 
 

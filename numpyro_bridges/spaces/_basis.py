@@ -47,7 +47,28 @@ class AbstractBasis(AbstractSpace):
 
     The H-norm is the Euclidean norm of the coefficients. Fields are evaluated at q points of the
     domain, `grid`: with Φ the (q, n) values of the basis there, points are Φ x and the coefficients
-    of a field f are Φᵀ f / q, Φᵀ Φ / q = I.
+    of a field f are Φᵀ f / q, Φᵀ Φ / q = I. Here are even functions on a circle:
+
+        class EvenBasis(nb.AbstractBasis):
+            num_modes: int = eqx.field(static=True)
+            dim: int = eqx.field(static=True)
+            num_quadrature: int = eqx.field(static=True)  # more than 2 num_modes
+
+            @property
+            def size(self):
+                return self.num_modes + 1
+
+            @property
+            def laplacian(self):
+                return -(jnp.arange(self.size) ** 2.0)
+
+            def parameters(self, count):
+                return 2 * np.pi * np.arange(count) / count
+
+            def functions(self, s):
+                frequency = jnp.arange(self.size)
+                norm = jnp.where(frequency == 0, 1.0, jnp.sqrt(2))
+                return norm * jnp.cos(jnp.outer(s, frequency))
     """
 
     num_quadrature: eqx.AbstractVar[int]
