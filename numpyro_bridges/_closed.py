@@ -26,7 +26,7 @@ from ._linalg import full_precision, varying_axes, varying_like
 
 
 class _Program:
-    """A traced function without the arrays that it captures."""
+    """A traced function without the arrays that it captures; compared by identity."""
 
     def __init__(self, jaxpr: Jaxpr, structure: Any):
         self.jaxpr = jaxpr
@@ -86,6 +86,7 @@ class Closed(eqx.Module):
             f"{[x.shape for x in leaves]}, or with objects of another structure. For other shapes "
             "make a new object from the function itself.",
         )
+        # A program has one type for each input, as the function that was traced had.
         leaves = [x.astype(a.dtype) for x, a in zip(leaves, types, strict=True)]
         if any(varying_axes(x) for x in (*leaves, *self.captured)):
             (out,) = _marked(self.program.jaxpr, self.captured, leaves)
@@ -100,7 +101,8 @@ def _marked(jaxpr: Jaxpr, captured, leaves) -> list:
     Each operation there takes values that vary over the same devices, which the constants of a
     program that was traced outside do not.
     """
-    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*captured, *leaves], strict=True))
+    variables = [*jaxpr.constvars, *jaxpr.invars]
+    values = dict(zip(variables, [*captured, *leaves], strict=True))
 
     def read(variables):
         return [jnp.asarray(v.val) if isinstance(v, Literal) else values[v] for v in variables]
@@ -109,6 +111,7 @@ def _marked(jaxpr: Jaxpr, captured, leaves) -> list:
         inputs = read(eqn.invars)
         inputs = varying_like(inputs, *inputs)
         if eqn.primitive.name in ("jit", "pjit"):
+            # a program within: its constants have to be marked too
             inner = eqn.params["jaxpr"]
             outputs = _marked(inner.jaxpr, inner.consts, inputs)
         else:
@@ -134,6 +137,7 @@ def close(function: Callable, *args) -> Closed:
         jnp.array(c, copy=True) if isinstance(c, Tracer) else jnp.asarray(c) for c in traced.consts
     ]
     key: Hashable = (structure, _key(traced.jaxpr))
+    # The same values, but two users may have written two derivatives.
     if rules := _rules(traced):
         key = key, _derivative(traced.jaxpr, [*captured, *leaves], "custom_vjp_call" in rules)
     program = _programs.get(key)
@@ -141,6 +145,7 @@ def close(function: Callable, *args) -> Closed:
         program = _Program(traced.jaxpr, structure)
         _programs[key] = program
     if not any(isinstance(c, Tracer) for c in captured):
+        # Kept for pickling: types in the place of arrays, which may be large.
         types = list(map(_type, traced.jaxpr.invars))
         source = function, *eqx.combine(jax.tree.unflatten(structure, types), static)
         if source not in program.sources:
@@ -172,6 +177,7 @@ _RULES = {"custom_jvp_call", "custom_vjp_call"}
 
 
 def _key(jaxpr: Jaxpr) -> Hashable:
+    """Equal for programs that are equal but for the names of their variables."""
     number: dict[Any, int] = {}
 
     def name(v):
@@ -190,6 +196,7 @@ def _key(jaxpr: Jaxpr) -> Hashable:
 
 def _parameters(eqn) -> Hashable:
     if eqn.primitive.name in _RULES:
+        # The rule itself is a new function each time; what it says is asked of `_derivative`.
         return tuple(
             _value(value)
             for value in eqn.params.values()
@@ -254,20 +261,17 @@ def _rules(value: Any) -> set[str]:
 
 
 def _derivative(jaxpr: Jaxpr, inputs: list, reverse: bool) -> Hashable:
-    """What rules of differentiation say of the derivative; nothing is like it where it cannot be
-    traced.
-    """
+    """What rules say of the derivative; where it cannot be traced nothing is equal to it."""
     inexact = [i for i, x in enumerate(inputs) if jnp.issubdtype(x.dtype, jnp.inexact)]
     num_captured = len(jaxpr.constvars)
 
     def derivative(*inputs):
         def call(*moved):
-            values = list(
-                (dict(enumerate(inputs)) | dict(zip(inexact, moved, strict=True))).values()
-            )
-            return jaxpr_as_fun(ClosedJaxpr(jaxpr, values[:num_captured]))(*values[num_captured:])[
-                0
-            ]
+            # only numbers move; integers and keys stay
+            by_place = dict(enumerate(inputs)) | dict(zip(inexact, moved, strict=True))
+            values = list(by_place.values())
+            program = jaxpr_as_fun(ClosedJaxpr(jaxpr, values[:num_captured]))
+            return program(*values[num_captured:])[0]
 
         moved = tuple(inputs[i] for i in inexact)
         if not reverse:

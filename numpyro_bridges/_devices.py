@@ -80,11 +80,11 @@ def spread(
 def mesh_for(
     size: int, name: str, mesh: Mesh | None = None, axis: str | None = None
 ) -> Mesh | None:
-    """The mesh on which a batch of `size` items, which an error calls `name`, runs; None where
-    there is one device.
-    """
+    """The mesh for a batch of `size` items, which an error calls `name`; None on one device."""
     require_mesh(mesh, axis)
     if mesh is None:
+        # A user who has said which device gets that one. Else those of this process only, as many
+        # as divide the batch: what runs on those of several has to be called in each process.
         chosen = getattr(jax.config, "jax_default_device", None)
         local = jax.local_devices() if chosen is None else []
         number = max((n for n in range(1, len(local) + 1) if size % n == 0), default=1)
@@ -106,6 +106,7 @@ def gather(tree: Any) -> Any:
     def whole(x):
         if not isinstance(x, jax.Array) or len(x.sharding.device_set) == 1:
             return x
+        # Through NumPy, which makes an array on one device of what lies on several.
         here = x.is_fully_addressable or x.is_fully_replicated
         return jnp.asarray(
             np.asarray(x if here else multihost_utils.process_allgather(x, tiled=True))

@@ -17,10 +17,9 @@ from ._types import State, Structured
 
 
 def full_precision(f):
-    """Products in `f` keep float32, where a GPU's default is a 10-bit mantissa (TF32): weights need
-    every digit.
-    """
+    """Products in `f` keep float32, where a GPU's default is a 10-bit mantissa (TF32)."""
 
+    # Weights need every digit. The setting is read while a program is traced, not when it runs.
     @functools.wraps(f)
     def wrapped(*args, **kwargs):
         with jax.default_matmul_precision("highest"):
@@ -55,6 +54,7 @@ def varying_axes(leaf) -> frozenset:
 
 
 def _mark_varying(leaf, axes):
+    # `pvary` is the older name
     return lax.pcast(leaf, axes, to="varying") if hasattr(lax, "pcast") else lax.pvary(leaf, axes)
 
 
@@ -71,9 +71,7 @@ def apply(A: Structured, x: State) -> State:
 
 
 def product(A: Array, B: Array) -> Array:
-    """A B of matrices; without a `dot` where A is small, so that a batch of products is one loop
-    over all entries.
-    """
+    """A B of matrices; without a `dot` where A is small: a batch is one loop over all entries."""
     return jnp.sum(A[:, :, None] * B[None], axis=1) if A.shape[0] <= 4 else A @ B
 
 
@@ -93,13 +91,16 @@ def compose(A: Structured, B: Structured) -> Structured:
 
 def congruence(A: Structured, S: Structured) -> Structured:
     """A S Aᵀ, of the same or a larger rank than S."""
-    return S * (A @ A.T) if A.ndim == 2 and S.ndim == 0 else compose(compose(A, S), transpose(A))
+    if A.ndim == 2 and S.ndim == 0:
+        return S * (A @ A.T)
+    return compose(compose(A, S), transpose(A))
 
 
 def add(A: Structured, B: Structured) -> Structured:
     """A + B."""
     if A.ndim < B.ndim:
         A, B = B, A
+    # Shapes would broadcast without this, and a diagonal be added to every row.
     return A + diagonal_matrix(B, A.shape[0]) if A.ndim == 2 and B.ndim < 2 else A + B
 
 
@@ -121,18 +122,15 @@ def promote(A: Structured, ndim: int, n: int) -> Structured:
 
 
 def safe_sqrt(x: ArrayLike) -> Array:
-    """√x whose derivative at exactly 0 is 0, where that of √x is infinite: of |y| = √y² the mean of
-    both sides.
-    """
+    """√x with slope 0 at exactly 0, where that of √x is infinite: of √y² the mean of both sides."""
     zero = x == 0
     # the inner `where` keeps the infinite slope, the outer one the value 1, out of the result
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, x)))
 
 
 def cholesky(S: Structured) -> Structured:
-    """Lower factor C with C Cᵀ = S; NaN where S is not positive definite, but for zeros of a
-    diagonal one.
-    """
+    """Lower factor C with C Cᵀ = S; NaN where it has none, but for zeros of a diagonal S."""
+    # Callers give symmetric matrices: to symmetrise them again costs a pass, forward and backward.
     return safe_sqrt(S) if S.ndim < 2 else lax.linalg.cholesky(S, symmetrize_input=False)
 
 
@@ -141,13 +139,12 @@ def semidefinite_cholesky(S: Structured) -> Structured:
     if S.ndim < 2:
         return safe_sqrt(S)
     empty = without_variance(S)
+    # Filled first: a NaN of the factorisation would survive in slopes, whatever is put over it.
     return jnp.where(empty[:, None], 0.0, cholesky(filled(S, empty)))
 
 
 def without_variance(S: Structured) -> Array:
-    """Where the diagonal of a covariance, or of its factor, is 0: `()` for a multiple of the
-    identity, else `(m,)`.
-    """
+    """Where the diagonal of a covariance or a factor is 0: `()` for a scalar, else `(m,)`."""
     return (jnp.diagonal(S) if S.ndim == 2 else S) == 0
 
 
@@ -159,9 +156,7 @@ def filled(S: Structured, empty: Array) -> Structured:
 
 
 def symmetric(S: Structured) -> Structured:
-    """½ (S + Sᵀ): the derivative of a factorisation holds for symmetric matrices only, and a
-    parameter is any.
-    """
+    """½ (S + Sᵀ): a factorisation has derivatives for symmetric matrices; a parameter is any."""
     return 0.5 * (S + S.T) if S.ndim == 2 else S
 
 

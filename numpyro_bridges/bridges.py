@@ -1,6 +1,4 @@
-"""Guided bridges: an SDE conditioned on what is seen at a later time, as a function of standard
-normal noise.
-"""
+"""Guided bridges: an SDE conditioned on what is seen later, driven by standard normal noise."""
 
 import functools
 from collections.abc import Callable
@@ -16,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from numpy.typing import ArrayLike
 
 from ._checks import as_float, concrete, require, require_finite, require_instance, require_key
-from ._linalg import apply, congruence, full_precision, promote, varying_like
+from ._linalg import apply, columns, congruence, full_precision, promote, varying_like
 from ._types import RealScalar, State
 from .conditioning import AbstractCondition, GaussianMessage, Observation, Target
 from .guiding import (
@@ -38,12 +36,15 @@ Method = TypeVar("Method", bound=Callable)
 
 
 class _PureMethod:
-    """Binds to a partial function, which `jax.jit` takes as it is: equinox's bound methods hash
-    their arrays.
+    """Binds to a partial function, which `jax.jit` takes as it is.
+
+    A bound method of equinox is a module, hashed by its leaves, and arrays have no hash; a partial
+    function is hashed by its identity.
     """
 
     def __init__(self, method):
-        self.method, self.__doc__ = method, method.__doc__
+        self.method = method
+        self.__doc__ = method.__doc__
 
     def __get__(self, instance, owner=None):
         if instance is None:
@@ -52,6 +53,7 @@ class _PureMethod:
 
 
 def _pure_method(method: Method) -> Method:
+    # for type checkers and the documentation it is the method still
     return cast(Method, _PureMethod(method))
 
 
@@ -82,9 +84,9 @@ class GuidedBridge(eqx.Module):
     - `condition`: `match.at(v)` or a `CylinderSet`.
     - `x0`: `(n, dim)` or `(n,)`.
     - `t1`, `t0`: the interval, in the time units of the SDE; t0 is 0 unless given.
-    - `num_steps`, or `ts`: the number of steps of the default grid, or an increasing grid `(K +
-      1,)` from t0 to t1. The default is uniform, and graded towards t1, t = s(2 − s/T), where the
-      end state is pinned. A grid whose steps vanish in the precision used is refused.
+    - `num_steps`, or `ts`: the number of steps of the default grid, or an increasing grid
+      `(K + 1,)` from t0 to t1. The default is uniform, and graded towards t1, t = s(2 − s/T), where
+      the end state is pinned. A grid whose steps vanish in the precision used is refused.
     - `guide`: by default `FrozenGuide()` where a is constant, `GeodesicGuide()` for a Kunita flow,
       `RecedingGuide()` where a depends on the state otherwise, both with `rounds=2` for a
       `SemilinearSDE`.
@@ -104,9 +106,7 @@ class GuidedBridge(eqx.Module):
     guide: AbstractGuide
     solver: diffrax.AbstractSolver
     flat: "GuidedBridge | None"
-    """The bridge that is computed where the condition is approximated: its states are those of
-    this, flattened.
-    """
+    """Of flattened states: the one that is computed where the condition is approximated."""
 
     def __init__(
         self,
@@ -135,23 +135,32 @@ class GuidedBridge(eqx.Module):
         )
         require_finite(x0, "x0")
         grid = time_grid(t0, t1, num_steps, ts, graded=condition.exact)
+        # A user's functions are frozen before anything else calls them, even a check of shapes.
         sde = sde.closed(grid.elapsed[0], x0)
         sde.check_state(x0)
         x0 = sde.start(x0)
         condition = condition.closed(x0)
         condition.check(sde, x0)
         clock = grid.clock(sde, x0)
+        # The law of the end is a pass over the grid, made only by a condition that asks for it.
         condition = condition.anchored(sde, lambda: law_of_end(sde, x0, clock + grid.elapsed))
         if guide is None:
             guide = default_guide(sde, x0)
-            guide = (
-                FrozenGuide() if solver is not None and isinstance(guide, FrozenGuide) else guide
-            )
+            if solver is not None and isinstance(guide, FrozenGuide):
+                # The default may have rounds, which have no continuous weight.
+                guide = FrozenGuide()
         require_instance(guide, AbstractGuide, "guide", "a guide, such as `FrozenGuide()`")
-        self.sde, self.condition, self.x0 = sde, condition, x0
-        self.grid, self.clock, self.flat = grid, clock, None
+        self.sde = sde
+        self.condition = condition
+        self.x0 = x0
+        self.grid = grid
+        self.clock = clock
+        self.flat = None
         self.solver = GuidedStep() if solver is None else solver
         if condition.is_approximated and x0.ndim == 2:
+            # The approximation sees the columns of a state together, and the maps of this package
+            # act on each column alike. So all is computed for states of one column; this bridge
+            # only reshapes, and the guide is checked and closed by the other.
             flat = Flattened(sde, x0.shape[1])
             self.guide = guide
             self.flat = GuidedBridge(
@@ -183,37 +192,48 @@ class GuidedBridge(eqx.Module):
             f"{self.solver!r}.",
         )
         if not self._is_discrete:
-            frame, _, seen, reference, ts = self.problem()
-            auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
-            if self.condition.exact:
-                a = congruence(seen.operator, frame.sde.covariance(ts[-1], reference))
-                a_aux = congruence(seen.operator, auxiliary.covariance(ts[-1], reference))
-                ndim, m = max(a.ndim, a_aux.ndim), apply(seen.operator, reference).shape[0]
-                gap = jnp.max(jnp.abs(promote(a, ndim, m) - promote(a_aux, ndim, m)))
-                require(
-                    gap <= 1e-5 * jnp.max(jnp.abs(a)),
-                    "`auxiliary` must match the SDE at the observed end, L ã(T) Lᵀ = L a(T, v) "
-                    "Lᵀ, for the continuous weight of an exact match: they differ by "
-                    f"{concrete(gap)}, which gives finite and wrong weights. Use `FrozenGuide()` "
-                    "without an auxiliary, the default solver, or an inexact match.",
-                )
+            self._check_continuous()
+
+    def _check_continuous(self):
+        """The guide has one auxiliary process, and it fits an exact end."""
+        frame, _, seen, reference, ts = self.problem()
+        auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
+        if not self.condition.exact:
+            return
+        a = congruence(seen.operator, frame.sde.covariance(ts[-1], reference))
+        a_aux = congruence(seen.operator, auxiliary.covariance(ts[-1], reference))
+        # One may be a number or a diagonal where the other is a matrix.
+        ndim = max(a.ndim, a_aux.ndim)
+        m = apply(seen.operator, reference).shape[0]
+        gap = jnp.max(jnp.abs(promote(a, ndim, m) - promote(a_aux, ndim, m)))
+        # Of a mismatch neither ESS nor k̂ gives a sign: it must be refused here. What is equal but
+        # for rounding in single precision passes.
+        require(
+            gap <= 1e-5 * jnp.max(jnp.abs(a)),
+            "`auxiliary` must match the SDE at the observed end, L ã(T) Lᵀ = L a(T, v) "
+            "Lᵀ, for the continuous weight of an exact match: they differ by "
+            f"{concrete(gap)}, which gives finite and wrong weights. Use `FrozenGuide()` "
+            "without an auxiliary, the default solver, or an inexact match.",
+        )
 
     def _check_exact(self):
         seen, _ = self.end()
         ts = self.grid.elapsed
+        # A step of the last one's length, from x0: where the last one begins is random.
         law = self.sde.transition(self.clock, self.clock + (ts[-1] - ts[-2]), self.x0)
         S = congruence(seen.operator, law.covariance)
-        if concrete(S) is not None:
-            pivots = jnp.linalg.cholesky(S) if S.ndim == 2 else jnp.sqrt(S)
-            pivots = jnp.diagonal(pivots) if S.ndim == 2 else pivots
-            scale = jnp.sqrt(jnp.max(jnp.abs(S)))
-            require(
-                # of variances 1e-14: a singular matrix has pivots of rounding
-                jnp.all(pivots > 1e-7 * scale),
-                "`condition` is an exact match, which needs noise in every observed direction, "
-                "and the covariance of the last step, L a Lᵀ dt, is singular: an observed "
-                "component has no noise of its own. Use `InexactMatch` with a small variance.",
-            )
+        if concrete(S) is None:
+            # A traced one cannot be refused: its log weight is −inf or NaN, see `ExactMatch`.
+            return
+        pivots = jnp.diagonal(jnp.linalg.cholesky(S)) if S.ndim == 2 else jnp.sqrt(S)
+        scale = jnp.sqrt(jnp.max(jnp.abs(S)))
+        require(
+            # of variances 1e-14: a singular matrix has pivots of rounding
+            jnp.all(pivots > 1e-7 * scale),
+            "`condition` is an exact match, which needs noise in every observed direction, "
+            "and the covariance of the last step, L a Lᵀ dt, is singular: an observed "
+            "component has no noise of its own. Use `InexactMatch` with a small variance.",
+        )
 
     @property
     def _is_discrete(self) -> bool:
@@ -236,17 +256,12 @@ class GuidedBridge(eqx.Module):
 
     @property
     def noise_shape(self) -> tuple[int, int, int]:
-        """(num_steps, k, dim): k noises per coordinate. A `CylinderSet` has one row more, to draw
-        its point.
-        """
+        """(num_steps, k, dim): k noises per coordinate; one row more where the condition draws."""
         k = self.sde.noise_size(self.x0)
         if not self._is_discrete and issubclass(levy_area(self.solver), diffrax.SpaceTimeLevyArea):
-            k = 2 * k
-        return (
-            self.num_steps + self.condition.num_extra_noises,
-            k,
-            self.x0.shape[1] if self.x0.ndim == 2 else 1,
-        )
+            k = 2 * k  # the second half drives the area, see `GridNoise`
+        num_rows = self.num_steps + self.condition.num_extra_noises
+        return num_rows, k, columns(self.x0)
 
     def with_guide(self, guide: AbstractGuide) -> "GuidedBridge":
         """The same bridge, led by another guide: the same estimand."""
@@ -256,9 +271,7 @@ class GuidedBridge(eqx.Module):
 
     @_pure_method
     def path(self, noise: Float[Array, "K k dim"]) -> Float[Array, "K+1 n *dim"]:
-        """The states at `ts`, the first being x0. Weighted by exp(log_weight(noise)) it has the
-        conditioned law.
-        """
+        """The states at `ts`, from x0: of the conditioned law, if weighted by exp(log weight)."""
         return self._run(noise)[0]
 
     @_pure_method
@@ -283,9 +296,7 @@ class GuidedBridge(eqx.Module):
         return noise
 
     def _split(self, noise):
-        """Rows that choose the target, rows that drive the steps; columns dropped for vector
-        states.
-        """
+        """Rows that choose the target, and rows that drive the steps, shaped like states."""
         noise = self._driving(noise)
         noise = noise[..., 0] if self.x0.ndim == 1 else noise
         extra = self.condition.num_extra_noises
@@ -294,23 +305,25 @@ class GuidedBridge(eqx.Module):
     def _drawn(self, extra) -> "GuidedBridge":
         """With what the rows of extra noise choose of the condition."""
         condition = self.condition.drawn(extra)
-        return (
-            self
-            if condition is self.condition
-            else eqx.tree_at(lambda b: b.condition, self, condition)
-        )
+        if condition is self.condition:
+            return self
+        return eqx.tree_at(lambda b: b.condition, self, condition)
 
     def end(self) -> tuple[Observation, State]:
         """What is seen of the end state, and a state that meets the condition."""
         seen = self.condition.observation(self.sde, self.x0)
-        free, ts = self.x0, self.shown_ts
+        free = self.x0
+        ts = self.shown_ts
+        # Differences of `shown_ts` would lose digits at a large t0.
         dt = jnp.diff(self.grid.elapsed)
 
         def without_noise(x, step):
             t, dt = step
             return self.sde.transition(t, t + dt, x).mean, None
 
-        if seen.operator.ndim or self.condition.num_extra_noises:  # part of the end state is open
+        # What the condition leaves open of the end state, a part or a choice inside a set, is taken
+        # from where the process goes without noise.
+        if seen.operator.ndim or self.condition.num_extra_noises:
             start = varying_like(free, self.sde, ts, dt)
             free, _ = jax.lax.scan(without_noise, start, (ts[:-1], dt))
         reference = self.condition.reference(self.sde, free)
@@ -326,12 +339,14 @@ class GuidedBridge(eqx.Module):
         seen, end = self.end()
         x = self.x0 if x is None else x
         if self._is_discrete and self.guide.moves:
+            # Times before `since` have come when the path begins: the origin has not moved at them.
             left = jnp.maximum(self.grid.elapsed, since) - since
             frame = self.sde.frame(x, end, left, self.clock)
         else:
             frame = still_frame(self.sde, x, end, self.grid.elapsed, self.clock)
         condition = self.condition.displaced(apply(seen.operator, end))
-        return Problem(frame, condition, seen, jnp.zeros_like(end), self.grid.elapsed)
+        reference = jnp.zeros_like(end)  # `end`, as a displacement from itself
+        return Problem(frame, condition, seen, reference, self.grid.elapsed)
 
     def observed(self) -> State:
         """The value that is observed; `ValueError` for a set."""
@@ -339,6 +354,7 @@ class GuidedBridge(eqx.Module):
             self.condition.num_extra_noises == 0,
             "`condition` is a set, which has no observed value.",
         )
+        # A datum is the target whatever the law of what is seen: any law will do.
         return self.condition.target(self.x0, jnp.ones(()), jnp.zeros((0,))).value
 
     def _before_the_end(self, t, x) -> tuple[Array, State]:
@@ -358,25 +374,20 @@ class GuidedBridge(eqx.Module):
 
     @_pure_method
     def log_h(self, t: RealScalar, x: State) -> Float[Array, ""]:
-        """log h̃(t, x) of the guide, t before t1: log density of the datum, or log probability of
-        the set, from x.
-        """
+        """log h̃(t, x), t before t1: log density of the datum, or probability of the set, from x."""
         return self._log_h_and_score(*self._before_the_end(t, x))[0]
 
     @_pure_method
     def score(self, t: RealScalar, x: State) -> State:
-        """∇ log h̃(t, x), the guide's covariance held fixed: where the path is pulled, before a(x)
-        acts on it.
+        """∇ log h̃(t, x), the guide's covariance held fixed; a learned guide's network is in it.
 
-        A learned guide's network is in it.
+        Where the path is pulled, before a(x) acts on it.
         """
         return self._log_h_and_score(*self._before_the_end(t, x))[1]
 
     @_pure_method
     def scores(self, path: Float[Array, "K+1 n *dim"]) -> Float[Array, "K n *dim"]:
-        """∇ log h̃ at the grid times, the end left out, from the states of a path: one plan for all
-        of them.
-        """
+        """∇ log h̃ at the grid times but the last, from the states of a path: one plan for all."""
         path = as_float(path, "path").astype(self.x0.dtype)
         shape = (self.num_steps + 1, *self.x0.shape)
         require(
@@ -388,26 +399,28 @@ class GuidedBridge(eqx.Module):
     @eqx.filter_jit
     @full_precision
     def _log_h_and_score(self, since, x: State) -> tuple[Float[Array, ""], State]:
-        """The time is put into the grid behind t0; steps before it have no length and change
-        nothing.
-        """
         if self.flat is not None:
             value, score = self.flat._log_h_and_score(since, x.reshape(-1))
             return value, score.reshape(x.shape)
         problem = self.problem(x, since)
+        start = problem.frame.start
         if not self._is_discrete:
-            return self._value_and_score(problem, None, None, since, problem.frame.start)
+            return self._value_and_score(problem, None, None, since, start)
+        # 0, `since`, and the grid, of which earlier times become `since`: their steps have no
+        # length and change nothing. So one program serves all times, with the number of steps
+        # static, and entry 1 of the plan is the forecast at `since`.
         ts = jnp.concatenate([problem.ts[:1], jnp.maximum(problem.ts, since)])
         plan = self.plan(self.guide, problem, ts)
         entry = jax.tree.map(lambda a: a[1], plan.steps)
-        return self._value_and_score(problem, plan, entry, since, problem.frame.start)
+        return self._value_and_score(problem, plan, entry, since, start)
 
     @eqx.filter_jit
     @full_precision
     def _scores(self, path):
         if self.flat is not None:
             return self.flat._scores(path.reshape(len(path), -1)).reshape(-1, *self.x0.shape)
-        problem, ts = self.problem(), self.grid.elapsed[:-1]
+        problem = self.problem()
+        ts = self.grid.elapsed[:-1]
         y = path[:-1] - problem.frame.origins[:-1]
         if not self._is_discrete:
             return jax.vmap(lambda t, y: self._value_and_score(problem, None, None, t, y)[1])(ts, y)
@@ -417,7 +430,8 @@ class GuidedBridge(eqx.Module):
 
     def _message(self, problem: Problem, plan, entry, t, y: State) -> GaussianMessage:
         """The guide's forecast of what is seen, a displacement, from y."""
-        frame, condition, seen, reference, ts = problem
+        frame, _, seen, reference, ts = problem
+        # Only operator, shift and factor are asked for: the condition knows its datum.
         blank = jnp.zeros_like(apply(seen.operator, y))
         if plan is None:
             auxiliary = self.guide.auxiliary_process(frame.sde, reference, ts[-1])
@@ -425,12 +439,12 @@ class GuidedBridge(eqx.Module):
         return plan.message(entry, frame.sde, t, y, blank)
 
     def _value_and_score(self, problem, plan, entry, t, y) -> tuple[Float[Array, ""], State]:
+        # Outside of what is differentiated: its covariance, which may depend on y, is held fixed.
         message = self._message(problem, plan, entry, t, y)
 
         def log_h(y):
-            return problem.condition.log_value(
-                apply(message.operator, y) + message.shift, message.factor
-            )
+            mean = apply(message.operator, y) + message.shift
+            return problem.condition.log_value(mean, message.factor)
 
         value, score = jax.value_and_grad(log_h)(y)
         if plan is not None:
@@ -440,11 +454,11 @@ class GuidedBridge(eqx.Module):
     def _target(self, problem: Problem, plan, extra) -> Target:
         start = problem.frame.start
         if extra.shape[0] == 0:
+            # Without a draw the law is not looked at, and the forecast at t0 need not be computed.
             return problem.condition.target(start, jnp.ones(()), extra)
         message = self._start(problem, plan)
-        return problem.condition.target(
-            apply(message.operator, start) + message.shift, message.factor, extra
-        )
+        mean = apply(message.operator, start) + message.shift
+        return problem.condition.target(mean, message.factor, extra)
 
     def _start(self, problem: Problem, plan) -> GaussianMessage:
         """The forecast at t0."""
@@ -461,6 +475,8 @@ class GuidedBridge(eqx.Module):
         """A guide's plan for the grid, or for one with the same end."""
         frame, _, seen, reference, grid = problem
         observed = apply(seen.operator, reference)
+        # Of a still frame, whose origin is the end at all times: a guide that looks at `start`
+        # does not let the frame move.
         start = self.x0 - frame.origins[-1]
         guide = guide.prepared(frame.sde, seen, observed, reference, grid, start)
         return guide.plan(frame.sde, seen, reference, grid if ts is None else ts)
@@ -472,6 +488,7 @@ class GuidedBridge(eqx.Module):
             path, log_weight = self.flat._run(self._driving(noise).reshape(self.flat.noise_shape))
             return path.reshape(-1, *self.x0.shape), log_weight
         extra, noise = self._split(noise)
+        # What is drawn comes before the plan, which is made for the observation that it chooses.
         self = self._drawn(extra)
         problem = self.problem()
         frame, _, seen, reference, ts = problem
@@ -486,8 +503,11 @@ class GuidedBridge(eqx.Module):
         else:
             path, log_weight = reach(frame.sde, plan, seen, ts, frame.start, noise, v)
         path = frame.origins[1:] + path
-        if self.condition.exact:  # to the last digit
+        if self.condition.exact:
+            # What is seen is met to the last digit, which the sum with the origin rounds.
             path = path.at[-1].set(self.condition.reference(self.sde, path[-1]))
+        # Ψ is that of the steps, of the choice of the target (a set), and of the condition over
+        # the observation by which it led the path (an approximated one).
         log_weight = log_weight + target.log_weight + self.condition.correction(self.sde, path[-1])
         return jnp.concatenate([self.x0[None], path]), log_weight
 
@@ -495,8 +515,8 @@ class GuidedBridge(eqx.Module):
     def guided_terms(
         self, noise: Float[Array, "K k dim"]
     ) -> tuple[GuidedTerm, Float[Array, " K"], Float[Array, "K+1 n *dim"]]:
-        """What `diffrax.diffeqsolve` solves by `GuidedStep()`: every step but the last, which is
-        onto the observation.
+        """What `diffrax.diffeqsolve` solves by `GuidedStep()`: every step but the last, onto the
+        observation.
 
             terms, ts, origins = bridge.guided_terms(noise)
             start = (bridge.x0 - origins[0], 0.0)
@@ -517,7 +537,8 @@ class GuidedBridge(eqx.Module):
             "is approximated.",
         )
         _, noise = self._split(noise)
-        frame, condition, _, _, ts = problem = self.problem()
+        problem = self.problem()
+        frame, condition, _, _, ts = problem
         require(
             condition.num_extra_noises == 0,
             "`condition` is a set, whose target `guided_terms` does not draw.",
@@ -525,7 +546,8 @@ class GuidedBridge(eqx.Module):
         plan = self._plan(problem)
         assert plan is not None
         observed = self._target(problem, plan, noise[:0]).value
-        return GuidedTerm.of(frame.sde, plan, observed, ts[:-1], noise[:-1]), ts[:-1], frame.origins
+        terms = GuidedTerm.of(frame.sde, plan, observed, ts[:-1], noise[:-1])
+        return terms, ts[:-1], frame.origins
 
     def noise_from_path(
         self, path: Float[Array, "K+1 n *dim"], key: PRNGKeyArray | None = None
@@ -551,9 +573,8 @@ class GuidedBridge(eqx.Module):
         return self._retrace(path, key)
 
     def _check_ends(self, path):
-        """A path of another bridge has other ends. To single precision, in which it may have been
-        kept.
-        """
+        """A path of another bridge has other ends."""
+        # to single precision, in which the path may have been kept
         near = 1e-6 * jnp.max(jnp.abs(path))
         start = jnp.max(jnp.abs(path[0] - self.x0))
         require(
@@ -575,6 +596,8 @@ class GuidedBridge(eqx.Module):
         if self.flat is not None:
             return self.flat._retrace(path.reshape(len(path), -1), key).reshape(self.noise_shape)
         if self.condition.is_approximated and self.condition.num_extra_noises:
+            # The scale τ at which this path was led cannot be read off it: it is drawn from its law
+            # given the path, and then the bridge is the one of that scale.
             key_draw, key = (None, None) if key is None else jr.split(key)
             shape = (1, self.noise_shape[1], *self.x0.shape[1:])
             self = self._drawn(self.condition.draw_of(path[-1], shape, key_draw))
@@ -582,17 +605,19 @@ class GuidedBridge(eqx.Module):
         frame, condition, seen, _, ts = problem
         plan = self._plan(problem)
         assert plan is not None
+        # The frame's own start may have digits that the difference of states has lost.
         y = (path - frame.origins).at[0].set(frame.start)
-        observed = (
-            apply(seen.operator, y[-1])
-            if seen.exact
-            else self._target(problem, plan, jnp.zeros((0,))).value
-        )
+        if seen.exact:
+            observed = apply(seen.operator, y[-1])  # a point of a set, too, is where the path ends
+        else:
+            observed = self._target(problem, plan, jnp.zeros((0,))).value
         z = retrace_reach(frame.sde, plan, seen, ts, y, observed, key)
         if condition.num_extra_noises:
             message = self._start(problem, plan)
             mean = apply(message.operator, frame.start) + message.shift
             row = condition.noise_from_target(mean, message.factor, observed)
-            row = jnp.pad(row, [(0, 0), (0, z.shape[1] - row.shape[1])] + [(0, 0)] * (z.ndim - 2))
+            # A set of few rows reads the beginning of a row of k noises; the rest has no effect.
+            unread = z.shape[1] - row.shape[1]
+            row = jnp.pad(row, [(0, 0), (0, unread)] + [(0, 0)] * (z.ndim - 2))
             z = jnp.concatenate([row, z])
         return z.reshape(self.noise_shape)

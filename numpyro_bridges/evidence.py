@@ -17,8 +17,7 @@ from .bridges import GuidedBridge
 
 
 class EvidenceEstimate(eqx.Module):
-    """An estimate of log p(condition | x0). `str` of it says whether it is to be trusted, and if
-    not, why.
+    """An estimate of log p(condition | x0). `str` of it says whether to trust it, and if not, why.
 
     - `log_evidence`: log of the mean weight, unsmoothed: the mean is unbiased, its log too low by
       about SE²/2.
@@ -109,6 +108,7 @@ def timed_estimate(
 ) -> tuple[EvidenceEstimate, float]:
     """The same, of any number of particles, and the seconds that paths took once compiled."""
     batches, mesh = _batches(key, num_particles, batch_size, mesh)
+    # Compiled for each size of batch, of which the last may have its own.
     for keys in {len(keys): keys for keys in batches}.values():
         jax.block_until_ready(_log_weights(bridge, keys, mesh))
     start = time.perf_counter()
@@ -121,8 +121,7 @@ def estimate_from(bridge: GuidedBridge, log_weights: Array) -> EvidenceEstimate:
     """What log weights of a bridge say of its evidence."""
     log_evidence = weights.log_mean_exp(log_weights)
     rounding = _rounding(bridge, float(log_evidence))
-    # Each of two log weights may be off by the rounding, and rounding errors have no tail to be
-    # judged by.
+    # Each of two log weights may be off by the rounding, and rounding errors have no tail.
     equal = jnp.ptp(log_weights) <= 2 * rounding
     judged = jnp.where(equal, log_evidence, log_weights)
     standard_error, ess, pareto_k = weights.quality(judged)
@@ -142,10 +141,13 @@ def _batches(
     """Keys of what runs at once, and the devices that share each batch of them."""
     mesh = mesh_for(num_particles, "`num_particles`", mesh)
     at_once = batch_size * (1 if mesh is None else mesh.size)
+    # A key for each particle, so that the estimate does not depend on batches or devices.
     keys = jr.split(key, num_particles)
     return [keys[i : i + at_once] for i in range(0, num_particles, at_once)], mesh
 
 
+# A function of the module, and the bridge its argument: bridges that differ in arrays only share
+# one compiled program.
 @eqx.filter_jit
 def _log_weights(bridge: GuidedBridge, keys, mesh: Mesh | None = None):
     def log_weight(key):

@@ -46,8 +46,7 @@ def effective_sample_size(log_weights: Float[Array, "... S"]) -> Float[Array, ".
 
 
 def standard_error(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
-    """Standard error of `log_mean_exp`, for the weights that were drawn and for those that were
-    not.
+    """Standard error of `log_mean_exp`, for weights that were drawn and for those that were not.
 
         error² = sd(w)² / (S mean(w)²) + missing²
         missing = σ n^κ / ((1 − κ)² S mean(w)),    κ = k̂ + (1 + max(k̂, 0)) / √n
@@ -73,8 +72,8 @@ def standard_error(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
 def pareto_k(log_weights: Float[Array, "... S"]) -> Float[Array, "..."]:
     """Shape k̂ of the generalised Pareto distribution fitted to the largest weights.
 
-    Moments of order 1/k and more are infinite: from k = 1/2 on the weights have no variance, from k
-    = 1 on no mean. The estimate of their mean and its `standard_error` are reliable up to
+    Moments of order 1/k and more are infinite: from k = 1/2 on the weights have no variance, from
+    k = 1 on no mean. The estimate of their mean and its `standard_error` are reliable up to
     `pareto_k_threshold`.
 
     The tail is the ⌈min(S/5, 3 √S)⌉ largest weights, as exceedances over the next smaller one; its
@@ -134,6 +133,7 @@ def _log_mean_exp(log_weights, axis):
 def _effective_sample_size(log_weights):
     weights = _relative(log_weights)
     squares = jnp.sum(weights**2, axis=-1)
+    # 0/0, of weights that are all 0, is to be 0
     return jnp.sum(weights, axis=-1) ** 2 / jnp.where(squares == 0, 1.0, squares)
 
 
@@ -161,6 +161,7 @@ def _error(log_weights, k, log_scale, n):
     mean = mean[..., 0]
     drawn = deviation / (jnp.where(mean == 0, 1.0, mean) * math.sqrt(num_particles))
 
+    # log of σ n^κ / ((1 − κ)² S mean(w)), where S mean(w) is the sum of the weights
     raised = k + (1 + jnp.maximum(k, 0.0)) / jnp.sqrt(n)
     log_missing = log_scale + raised * jnp.log(n) - 2 * jnp.log1p(-raised)
     log_missing -= jax.nn.logsumexp(log_weights, axis=-1)
@@ -184,9 +185,7 @@ def _tail_length(num_particles: int) -> int:
 
 @partial(jnp.vectorize, signature="(s)->(),(),()")
 def _tail(log_weights):
-    """Shape k̂ of the tail, the log of its scale σ, and the number n of weights that are above its
-    cutoff.
-    """
+    """Shape k̂ of the tail, log of its scale σ, and the number n of weights above its cutoff."""
     num_particles = log_weights.shape[0]
     num_tail = _tail_length(num_particles)
     ordered = jnp.sort(log_weights)
@@ -196,8 +195,7 @@ def _tail(log_weights):
     exceeds = tail > cutoff
     num_exceed = jnp.sum(exceeds)
     n = num_exceed.astype(log_weights.dtype)
-    # log of the exceedances y = exp(tail) − exp(cutoff), ascending; the ties with the cutoff come
-    # first
+    # log of the exceedances y = exp(tail) − exp(cutoff), ascending; ties with the cutoff come first
     log_y = tail + jnp.log1p(-jnp.exp(jnp.where(exceeds, cutoff - tail, -1.0)))
     log_y_max = log_y[-1]
     quartile = num_tail - num_exceed + jnp.maximum((num_exceed + 2) // 4 - 1, 0)
@@ -216,6 +214,9 @@ def _tail(log_weights):
         terms = jnp.where(jnp.abs(step) < 0.5, jnp.log1p(-step), stable)
         return jnp.sum(jnp.where(exceeds, terms, 0.0)) / n
 
+    # Zhang and Stephens: the posterior mean of b over a grid, weighted by the likelihood profile
+    # n (log|b/k| − k), k(b) = mean log(1 − b y) being the shape that fits best with b. Here it is
+    # the mean of a, linear in b. Constants do not matter to the weights.
     grid_size = 30 + math.isqrt(num_tail)
     grid = jnp.arange(1, grid_size + 1, dtype=log_weights.dtype) - 0.5
     log_a = jnp.log((jnp.sqrt(grid_size / grid) - 1) / 3)
@@ -229,7 +230,7 @@ def _tail(log_weights):
     log_mean_y = jax.nn.logsumexp(log_y, where=exceeds) - jnp.log(n)
     log_scale = jnp.log(jnp.abs(fitted / rate(log_a))) + log_y_quartile
     log_scale = jnp.where(rate(log_a) == 0, log_mean_y, log_scale)
-    fitted = (n * fitted + 5.0) / (n + 10.0)
+    fitted = (n * fitted + 5.0) / (n + 10.0)  # ten weights of shape 1/2
 
     ties = tail if num_tail >= 5 else ordered
     bounded = (ties[0] == ties[-1]) & (ties[0] > -jnp.inf)

@@ -21,8 +21,9 @@ from ..sdes import AbstractSDE
 
 
 class Observation(eqx.Module):
-    """v = operator x + N(0, factor factorᵀ), or v = operator x where `factor` is None; density
-    times exp(log_scale).
+    """v = operator x + N(0, factor factorᵀ), or v = operator x where `factor` is None.
+
+    Its density is multiplied by exp(log_scale).
     """
 
     operator: Structured
@@ -37,6 +38,7 @@ class Observation(eqx.Module):
     @property
     def covariance(self) -> Structured:
         """factor factorᵀ, 0 where it is exact."""
+        # of the least rank: what adds to it promotes it
         one = jnp.ones((), self.operator.dtype)
         return 0 * one if self.factor is None else congruence(self.factor, one)
 
@@ -49,7 +51,36 @@ class Target(eqx.Module):
 
 
 class AbstractCondition(eqx.Module):
-    """An event, or an observed value, of the end state."""
+    """An event, or an observed value, of the end state.
+
+    A subclass says what linear function of the end state is seen and with which Gaussian noise;
+    what is not linear is an `AbstractDensityMatch`. Here the sum of all rows is seen with an error:
+
+        class Total(nb.AbstractCondition):
+            value: Array  # (1, dim)
+            variance: Array
+            exact: ClassVar[bool] = False
+            num_extra_noises: ClassVar[int] = 0
+
+            def check(self, sde, x):
+                if self.value.shape != (1, *x.shape[1:]):
+                    raise ValueError(f"`value` must be of shape {(1, *x.shape[1:])}.")
+
+            def observation(self, sde, x):
+                return Observation(jnp.ones((1, len(x))), jnp.sqrt(self.variance), jnp.zeros(()))
+
+            def reference(self, sde, x):
+                return x + (self.value - x.sum(axis=0)) / len(x)
+
+            def log_value(self, law_mean, law_factor):
+                return gaussian_log_density(self.value - law_mean, law_factor)
+
+            def target(self, law_mean, law_factor, noise):
+                return Target(self.value, jnp.zeros(()))
+
+            def noise_from_target(self, law_mean, law_factor, seen):
+                return jnp.zeros((0, *seen.shape))
+    """
 
     num_extra_noises: eqx.AbstractClassVar[int]
     """Rows of noise that choose the target, before the first step."""
@@ -78,9 +109,7 @@ class AbstractCondition(eqx.Module):
 
     @abc.abstractmethod
     def log_value(self, law_mean: State, law_factor: Structured) -> Float[Array, ""]:
-        """log h̃: the density, or the probability, of the condition under N(mean, factor factorᵀ)
-        for what is seen.
-        """
+        """log h̃, if what is seen is N(mean, factor factorᵀ): log density, or log probability."""
 
     @abc.abstractmethod
     def target(
@@ -95,9 +124,7 @@ class AbstractCondition(eqx.Module):
         """The extra noise with which `target` chooses `seen`."""
 
     def closed(self, x: State) -> "AbstractCondition":
-        """The same condition for states shaped like x, with what a user's functions read frozen as
-        it is now.
-        """
+        """The same for states shaped like x, with what a user's functions read frozen."""
         return self
 
     def anchored(
@@ -120,9 +147,7 @@ class AbstractCondition(eqx.Module):
         return jnp.zeros(shape, x.dtype)
 
     def correction(self, sde: AbstractSDE, x: State) -> Float[Array, ""]:
-        """Log density, at the end state x, of the condition less that of the observation that paths
-        are led by.
-        """
+        """Log density at the end state x: of the condition, less that of what led the path."""
         return jnp.zeros((), x.dtype)
 
     def displaced(self, shift: State) -> "AbstractCondition":
@@ -131,11 +156,14 @@ class AbstractCondition(eqx.Module):
 
 
 class _Displaced(AbstractCondition):
+    """A condition that knows values, asked about displacements by `shift`."""
+
     condition: AbstractCondition
     shift: State
 
     def __init__(self, condition: AbstractCondition, shift: State):
-        self.condition, self.shift = condition, shift
+        self.condition = condition
+        self.shift = shift
 
     @property
     def num_extra_noises(self):
@@ -168,7 +196,24 @@ class _Displaced(AbstractCondition):
 
 
 class AbstractMatch(eqx.Module):
-    """A model of observation of the end state."""
+    """A model of observation of the end state.
+
+    `at(v)` is the condition that v was seen, often one that exists; it must be the density, in v,
+    of what `sample` draws. Here each coordinate is read off to the nearest multiple of a unit:
+
+        class Rounded(nb.AbstractMatch):
+            unit: Array
+
+            def at(self, observed):
+                observed = jnp.asarray(observed, float)
+                return nb.CylinderSet(observed - self.unit / 2, observed + self.unit / 2)
+
+            def sample(self, key, sde, x):
+                return self.unit * jnp.round(x / self.unit)
+
+            def check_density(self):
+                pass
+    """
 
     @abc.abstractmethod
     def at(self, observed) -> AbstractCondition:
@@ -179,15 +224,12 @@ class AbstractMatch(eqx.Module):
         """An observation of the end state x."""
 
     def closed(self, x: State, observed: State) -> Self:
-        """The same match for states like x and data like `observed`, with what a user's functions
-        read frozen.
-        """
+        """For states like x and data like `observed`, with what a user's functions read frozen."""
         return self
 
     def example(self, sde: AbstractSDE, x: State) -> Array:
-        """A datum that could be seen of the state x: for its shape, and where the real one is
-        masked.
-        """
+        """A datum that could be seen of x: for its shape, and where the real one is masked."""
+        # Which one does not matter, so the key is no argument.
         return self.sample(jr.key(0), sde, x)
 
     @abc.abstractmethod
@@ -201,7 +243,9 @@ def lift(operator: Structured, x: State, value: State) -> State:
         return value / operator
     if operator.ndim == 1:
         d = operator if x.ndim == 1 else operator[:, None]
+        # 0 is a row that is not seen, and stays; the inner `where` keeps the slope finite.
         return jnp.where(d == 0, x, value / jnp.where(d == 0, 1, d))
+    # x + L⁺ (v − L x): L⁺ r is the shortest way that changes L x by r
     inverse = jnp.linalg.pinv(operator)
     for _ in range(2):  # the second time to the last digit
         x = x + inverse @ (value - apply(operator, x))

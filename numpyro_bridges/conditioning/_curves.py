@@ -30,8 +30,9 @@ Points = Float[Array, "n dim"]
 
 
 class AbstractCurveMatch(AbstractDensityMatch):
-    """ψ(x) = exp(−‖μ_x − μ_v‖² / 2 variance), a kernel and no density of the curve v. A subclass
-    gives `inner`.
+    """ψ(x) = exp(−‖μ_x − μ_v‖² / 2 variance), a kernel and no density of the curve v.
+
+    A subclass gives `inner`.
     """
 
     variance: eqx.AbstractVar[Float[Array, ""]]
@@ -57,6 +58,8 @@ class AbstractCurveMatch(AbstractDensityMatch):
         def inner(y, z):
             return self.inner(_points(sde, y.reshape(x.shape)), _points(sde, z.reshape(x.shape)))
 
+        # With J the Jacobian of x ↦ μ_x, ∂_y ∂_z ⟨μ_y, μ_z⟩ at z = y is Jᵀ J: the curvature of
+        # ½ ‖μ_x − μ_v‖² without the term in the residual. It is never negative, and needs no v.
         y = x.reshape(-1)
         W = jax.jacfwd(jax.grad(inner), 1)(y, y) / self.variance.astype(x.dtype)
         return 0.5 * (W + W.T)
@@ -70,6 +73,8 @@ class AbstractCurveMatch(AbstractDensityMatch):
         )
         points = concrete(observed)
         if points is not None and np.all(np.isfinite(points)):
+            # A closed curve has an edge from its last point to its first: `append` is one point
+            # or none, by a slice of 1 or 0 of them.
             edges = np.diff(points, axis=0, append=points[: self.closed_curve])
             lengths = np.linalg.norm(edges, axis=1)
             require(
@@ -84,6 +89,7 @@ class AbstractCurveMatch(AbstractDensityMatch):
         points = _points(sde, x)
         if self.num_points is None:
             return points
+        # Only the number of points matters: they are put on the polygon, evenly in its index.
         last = len(points) - (not self.closed_curve)
         place = np.linspace(0.0, last, self.num_points, endpoint=not self.closed_curve)
         before = place.astype(int)
@@ -112,7 +118,8 @@ class CurrentMatch(AbstractCurveMatch):
         self.num_points = _count(num_points)
 
     def inner(self, x, y):
-        (c, edges), (d, others) = _edges(x, self.closed_curve), _edges(y, self.closed_curve)
+        c, edges = _edges(x, self.closed_curve)
+        d, others = _edges(y, self.closed_curve)
         return jnp.sum(_gaussian(c, d, self.length_scale) * (edges @ others.T))
 
 
@@ -157,12 +164,15 @@ class VarifoldMatch(AbstractCurveMatch):
         self.num_points = _count(num_points)
 
     def inner(self, x, y):
-        (c, edges), (d, others) = _edges(x, self.closed_curve), _edges(y, self.closed_curve)
-        lengths, other_lengths = (jnp.linalg.norm(e, axis=1) for e in (edges, others))
+        c, edges = _edges(x, self.closed_curve)
+        d, others = _edges(y, self.closed_curve)
+        # Data have no edge of length 0, which `at` refuses, and states have one with probability 0.
+        lengths = jnp.linalg.norm(edges, axis=1)
+        other_lengths = jnp.linalg.norm(others, axis=1)
+        tangents = edges / lengths[:, None]
+        other_tangents = others / other_lengths[:, None]
         near = _gaussian(c, d, self.length_scale)
-        along = _gaussian(
-            edges / lengths[:, None], others / other_lengths[:, None], self.angle_scale
-        )
+        along = _gaussian(tangents, other_tangents, self.angle_scale)
         return lengths @ (near * along) @ other_lengths
 
 
@@ -172,9 +182,8 @@ def _points(sde: AbstractSDE, x: State) -> Points:
 
 def _edges(points: Points, closed_curve: bool) -> tuple[Points, Points]:
     """Centres and vectors."""
-    first, second = (
-        (points, jnp.roll(points, -1, axis=0)) if closed_curve else (points[:-1], points[1:])
-    )
+    first = points if closed_curve else points[:-1]
+    second = jnp.roll(points, -1, axis=0) if closed_curve else points[1:]
     return 0.5 * (first + second), second - first
 
 

@@ -59,8 +59,12 @@ class CylinderSet(AbstractCondition):
     num_extra_noises: ClassVar[int] = 1
 
     def __init__(self, lower, upper):
-        low, high = known(lower, "lower"), known(upper, "upper")
-        lower, upper = as_float(lower, "lower"), as_float(upper, "upper")
+        # As the user gave them, before they are rounded: what is pinned, what is free and how wide
+        # an interval is are asked of these.
+        low = known(lower, "lower")
+        high = known(upper, "upper")
+        lower = as_float(lower, "lower")
+        upper = as_float(upper, "upper")
         shapes = lower.shape, upper.shape
         require(
             shapes[0] == shapes[1] or () in shapes,
@@ -82,8 +86,11 @@ class CylinderSet(AbstractCondition):
             low, high = np.broadcast_arrays(low, high)
             rows = _bounded_rows(low, high)
             lost = jnp.asarray(_lost_width(low, high, lower.dtype), lower.dtype)
+        # Static: how many rows are seen is the shape of an observation.
         self.rows = tuple(int(i) for i in rows)
-        self.lower, self.upper, self.lost = lower[rows], upper[rows], lost[rows]
+        self.lower = lower[rows]
+        self.upper = upper[rows]
+        self.lost = lost[rows]
 
     def check(self, sde, x):
         n = x.shape[0]
@@ -97,36 +104,38 @@ class CylinderSet(AbstractCondition):
     def observation(self, sde, x):
         n = x.shape[0]
         rows = jnp.eye(n, dtype=x.dtype)[np.array(self.rows)]
+        # All rows are the identity, a scalar: elementwise work, not products with a matrix.
         operator = jnp.ones((), x.dtype) if self.rows == tuple(range(n)) else rows
+        # A path is led to a point of the set, which it meets exactly.
         return Observation(operator, None, jnp.zeros((), x.dtype))
 
     def reference(self, sde, x):
-        low, high = self.lower.astype(x.dtype), self.upper.astype(x.dtype)
-        return lift(
-            self.observation(sde, x).operator, x, jnp.clip(x[np.array(self.rows)], low, high)
-        )
+        low = self.lower.astype(x.dtype)
+        high = self.upper.astype(x.dtype)
+        nearest = jnp.clip(x[np.array(self.rows)], low, high)
+        return lift(self.observation(sde, x).operator, x, nearest)
 
     def displaced(self, shift):
+        # `lost` is of the width, which a shift leaves as it is.
         def bounds(box):
             return box.lower, box.upper
 
         return eqx.tree_at(bounds, self, (self.lower - shift, self.upper - shift))
 
     def _bounds(self, like: State) -> tuple[State, State, State, Array]:
-        """Both bounds and the lost width in the precision of a state, and which coordinates are
-        pinned.
-        """
+        """Bounds and lost width in the precision of a state, and which coordinates are pinned."""
+        # Asked before the bounds are rounded, which may make close ones equal.
+        pinned = (self.lower == self.upper) & (self.lost == 0)
         lower, upper, lost = (a.astype(like.dtype) for a in (self.lower, self.upper, self.lost))
-        return lower, upper, lost, (self.lower == self.upper) & (self.lost == 0)
+        return lower, upper, lost, pinned
 
     def _scan(self, mean: State, factor: Structured, driver: State) -> tuple[State, State]:
-        """Coordinate after coordinate: the value chosen in its interval, and the log weight of the
-        choice.
-        """
+        """Coordinate after coordinate: the value chosen in its interval, and its log weight."""
         m = mean.shape[0]
         bounds = self._bounds(mean)
 
         def one(interval: tuple[Array, ...], center: Array, z: Array, scale: Array):
+            """A coordinate that is N(center, scale²) given those before it."""
             low, high, lost, pinned = interval
             empty = scale == 0
             scale = jnp.where(empty, 1.0, scale)
@@ -134,17 +143,20 @@ class CylinderSet(AbstractCondition):
             value = jnp.where(pinned, low, jnp.where(empty, jnp.clip(center, low, high), drawn))
             w = (value - center) / scale
             inside = log_interval_probability(*_free_where(pinned, low, high), center, scale, lost)
+            # −log r of the draw: r = N(value; center, scale²) / P. A pinned coordinate is not
+            # drawn, and its density is in the weight of the path.
             chosen = inside + 0.5 * w * w + _LOG_SQRT_2PI + jnp.log(scale)
             # a value without variance is outside the set, or inside, where its choice has no
             # density
             chosen = jnp.where(empty, jnp.where(value == center, jnp.nan, -jnp.inf), chosen)
             return value, jnp.where(pinned, 0.0, chosen), w
 
-        if factor.ndim < 2:
+        if factor.ndim < 2:  # independent coordinates, all at once
             value, log_weight, _ = one(bounds, mean, driver, _column(factor, mean))
             return value, log_weight
 
         def step(w, i):
+            # Of w the entries from i on are 0 still: N w is what earlier coordinates have moved.
             interval = tuple(a[i] for a in bounds)
             value, log_weight, w_i = one(interval, mean[i] + factor[i] @ w, driver[i], factor[i, i])
             return w.at[i].set(w_i), (value, log_weight)
@@ -155,6 +167,7 @@ class CylinderSet(AbstractCondition):
     def log_value(self, law_mean, law_factor):
         """In product form: coordinates independent given the state."""
         lower, upper, lost, pinned = self._bounds(law_mean)
+        # The probability of a box under dependence has no closed form: its marginals stand for it.
         scale = law_factor if law_factor.ndim < 2 else jnp.linalg.norm(law_factor, axis=1)
         scale = _column(scale, law_mean)
         w = (jnp.where(pinned, lower, 0.0) - law_mean) / scale
@@ -169,8 +182,10 @@ class CylinderSet(AbstractCondition):
 
     def noise_from_target(self, law_mean, law_factor, seen):
         lower, upper, lost, pinned = self._bounds(seen)
-        center, scale = law_mean, law_factor
+        center = law_mean
+        scale = law_factor
         if law_factor.ndim == 2:
+            # w = N⁻¹ (v − μ) is known, all at once, and v_i = center_i + N_ii w_i.
             scale = _column(jnp.diagonal(law_factor), seen)
             center = seen - scale * solve_lower(law_factor, seen - law_mean)
         scale = _column(scale, seen)
@@ -198,7 +213,8 @@ def _bounded_rows(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 def _lost_width(low: np.ndarray, high: np.ndarray, dtype) -> np.ndarray:
     """What high − low loses where both are rounded to `dtype`; 0 where one of them is infinite."""
     finite = np.isfinite(low) & np.isfinite(high)
-    low, high = np.where(finite, low, 0.0), np.where(finite, high, 0.0)
+    low = np.where(finite, low, 0.0)
+    high = np.where(finite, high, 0.0)
     return (high - low) - (high.astype(dtype) - low.astype(dtype)).astype(float)
 
 
@@ -258,7 +274,10 @@ class IntervalCensored(AbstractMatch):
         infinity = jnp.full((1,), jnp.inf, self.cuts.dtype)
         edges = jnp.concatenate([-infinity, self.cuts, infinity])
         is_bin = numbers == bins.astype(numbers.dtype)
-        box = CylinderSet(*(jnp.where(is_bin, edges[i], jnp.nan) for i in (bins, bins + 1)))
+        lower = jnp.where(is_bin, edges[bins], jnp.nan)
+        upper = jnp.where(is_bin, edges[bins + 1], jnp.nan)
+        box = CylinderSet(lower, upper)
+        # The set sees cut points that are rounded already; what that lost was kept with the cuts.
         return eqx.tree_at(lambda box: box.lost, box, self.lost[bins])
 
     def sample(self, key: PRNGKeyArray, sde: AbstractSDE, x: State) -> Array:

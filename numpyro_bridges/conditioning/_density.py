@@ -4,10 +4,10 @@ A path is led by a Gaussian ψ̃ and weighed by ψ: with all steps guided to wha
 
     E[exp(log weight under ψ̃) ψ(X_T) / ψ̃(X_T)] = E ψ(X_T),
 
-exactly for any ψ̃, so that a poor one costs variance and no bias. It is found where the law N(m, S
-Sᵀ) of the end state, of the SDE linearised along its path without noise, meets ψ best: at the mode
-of log ψ(m + S ξ) − ½ |ξ|². There ψ is replaced by the Gaussian of the same slope whose precision is
-W,
+exactly for any ψ̃, so that a poor one costs variance and no bias. It is found where the law
+N(m, S Sᵀ) of the end state, of the SDE linearised along its path without noise, meets ψ best: at
+the mode of log ψ(m + S ξ) − ½ |ξ|². There ψ is replaced by the Gaussian of the same slope whose
+precision is W,
 
     ψ̃(x) = N(v; L x, I),      Lᵀ L = W,      v = L x* + L⁻ᵀ ∇log ψ(x*).
 
@@ -37,24 +37,25 @@ from ..sdes import AbstractSDE, Flattened, for_every_column, wrapped
 from ._base import AbstractCondition, AbstractMatch, Observation, Target
 from ._message import gaussian_log_density
 
-_MOST_STEPS, _POLISHINGS = 20, 5
-"""Of Gauss and Newton, to the mode, and of Newton alone, near it."""
+_MOST_STEPS = 20
+"""Of Gauss and Newton, to the mode."""
+_POLISHINGS = 5
+"""Of Newton alone, near it."""
 _PARTS = 0.5 ** np.arange(8)
 """Of a step, the best of which is taken."""
 _GRID = np.linspace(-8.0, 8.0, 401)
-"""For integrals over the normal z of log τ = s z: the trapezoidal rule is exact, nearly, for what
-falls to 0.
+"""For integrals over the normal z of log τ = s z: what falls to 0 the trapezoidal rule has nearly
+exactly.
 """
 _FLAT = 1e-3
-"""Least curvature of log ψ̃, beside that of the law of the end state: with less, v would be too far
-for its digits.
+"""Least curvature of log ψ̃ beside that of the law of the end state: with less, v would be so far
+that its digits are lost.
 """
 _LOG_2PI = 1.8378770664093453
 
 
 class AbstractDensityMatch(AbstractMatch):
-    """A match that is known by log ψ(x), the log density of what is observed, given the end state
-    x.
+    """A match that is known by log ψ(x), the log density of what is observed of the end state x.
 
     A subclass gives `log_density`. Where it is no density of an observation, such as a kernel of a
     distance between curves, evidence is that of the kernel: ratios of it compare parameters of the
@@ -64,9 +65,7 @@ class AbstractDensityMatch(AbstractMatch):
 
     @property
     def spread(self) -> Float[Array, ""] | None:
-        """s, the standard deviation of log τ, for a ψ whose tails are heavier than those of a
-        normal density.
-        """
+        """s, the standard deviation of log τ, for a ψ whose tails are heavier than normal ones."""
         return None
 
     @abstractmethod
@@ -98,9 +97,7 @@ class AbstractDensityMatch(AbstractMatch):
         )
 
     def example(self, sde: AbstractSDE, x: State) -> Array:
-        """An observation, the end state x itself, where a subclass does not say that data look
-        otherwise.
-        """
+        """An observation: the end state x itself, unless a subclass says how data look."""
         return x
 
     def check_density(self) -> None:
@@ -144,7 +141,8 @@ class DensityMatch(AbstractDensityMatch):
             good = callable(f) or (f is None and name == "sample")
             shape = "(x, observed, args)" if name == "log_density" else "(key, x, args)"
             require(good, f"`{name}` must be a function f{shape}; got {f!r}.")
-        self.function, self.sampler = wrapped(log_density), sample
+        self.function = wrapped(log_density)
+        self.sampler = sample
         self.args = jax.tree.map(lambda leaf: as_float(leaf, "args"), args)
         self.log_scale_sd = None if spread is None else positive_scalar("spread")(spread)
         self.program = None
@@ -156,6 +154,8 @@ class DensityMatch(AbstractDensityMatch):
     def closed(self, x: State, observed: State) -> Self:
         if self.program is not None:
             return self
+        # A copy whose fields are set: a module is frozen, and its constructor takes other arguments
+        # than fields. Without the function, conditions that compute the same are equal to `jit`.
         closed = copy(self)
         object.__setattr__(closed, "program", close(self.function, x, observed, self.args))
         object.__setattr__(closed, "function", None)
@@ -178,8 +178,11 @@ class _Guiding(eqx.Module):
     """ψ̃, as a function of x.reshape(-1)."""
 
     anchor: State
+    """x*."""
     operator: Float[Array, "N N"]
+    """L."""
     value: Float[Array, " N"]
+    """v."""
     log_scale: Float[Array, ""]
     """That ψ̃ is to be scaled by to be ψ at the anchor."""
 
@@ -200,7 +203,10 @@ class _DensityCondition(AbstractCondition):
     is_approximated: ClassVar[bool] = True
 
     def __init__(self, match: AbstractDensityMatch, observed: State):
-        self.match, self.observed, self.guiding, self.draw = match, observed, None, None
+        self.match = match
+        self.observed = observed
+        self.guiding = None  # until it is `anchored`
+        self.draw = None  # until it is `drawn`
 
     @property
     def num_extra_noises(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -216,6 +222,8 @@ class _DensityCondition(AbstractCondition):
         return self if self.match.spread is None else self._with(draw=extra)
 
     def draw_of(self, x, shape, key):
+        # The row's other numbers have no effect. The first has the law of z given x, by inversion
+        # of its distribution function on the grid; without a key it is the median.
         rest = jnp.zeros(shape, x.dtype) if key is None else jr.normal(key, shape, x.dtype)
         log_mass = self._log_terms(x)
         place = 0.5 if key is None else jr.uniform(jr.fold_in(key, 1), dtype=x.dtype)
@@ -235,10 +243,10 @@ class _DensityCondition(AbstractCondition):
         z = jnp.asarray(_GRID, x.dtype)
         log_scale = self.match.spread.astype(x.dtype) * z
         r = self._known.value - self._known.operator @ x.reshape(-1)
-        log_density = 0.5 * len(r) * (log_scale - _LOG_2PI) - 0.5 * jnp.exp(log_scale) * jnp.sum(
-            r * r
-        )
-        return log_density - 0.5 * z * z - 0.5 * _LOG_2PI + jnp.log(z[1] - z[0])
+        square = jnp.exp(log_scale) * jnp.sum(r * r)
+        log_density = 0.5 * len(r) * (log_scale - _LOG_2PI) - 0.5 * square
+        log_prior = -0.5 * z * z - 0.5 * _LOG_2PI
+        return log_density + log_prior + jnp.log(z[1] - z[0])
 
     def closed(self, x):
         return self._with(match=self.match.closed(x, self.observed))
@@ -252,14 +260,17 @@ class _DensityCondition(AbstractCondition):
         )
 
     def _log_density(self, sde: AbstractSDE, x: State):
+        # A match is written for states; here they may be flattened.
         if isinstance(sde, Flattened):
-            sde, x = sde.sde, sde.rows(x)
+            x = sde.rows(x)
+            sde = sde.sde
         return self.match.log_density(sde, x, self.observed)
 
     def anchored(self, sde, find_law):
         if self.guiding is not None:
             return self
         guiding, slope = _guiding(self.match, self.observed, sde, *find_law())
+        # Asked where paths are led to: elsewhere ψ may be what it likes.
         for what, values in (("", slope[0]), ("slope of ", slope[1])):
             values = concrete(values)
             require(
@@ -276,6 +287,8 @@ class _DensityCondition(AbstractCondition):
 
     def correction(self, sde, x):
         if self.draw is not None:
+            # Over all τ that could have led a path here, not the one that has: the balance
+            # heuristic, by which no weight is large where some τ is wide enough.
             told = jax.nn.logsumexp(self._log_terms(x))
         else:
             told = self._known.log_density(x.reshape(-1))
@@ -283,9 +296,8 @@ class _DensityCondition(AbstractCondition):
 
     def observation(self, sde, x):
         sd = jnp.exp(-0.5 * self._log_scale()).astype(x.dtype)
-        return Observation(
-            self._known.operator.astype(x.dtype), sd, self._known.log_scale.astype(x.dtype)
-        )
+        operator = self._known.operator.astype(x.dtype)
+        return Observation(operator, sd, self._known.log_scale.astype(x.dtype))
 
     def reference(self, sde, x):
         return self._known.anchor.reshape(x.shape)
@@ -319,15 +331,19 @@ def _guiding(
     def precision(y):
         return match.precision(sde, y.reshape(mean.shape), observed)
 
+    # All columns have one covariance, and ψ sees them together.
     root = for_every_column(_root(covariance), mean.size // mean.shape[0])
     y = mean.reshape(-1) + root @ _mode(log_density, precision, mean.reshape(-1), root)
     value, slope = jax.value_and_grad(log_density)(y)
-    W, prior = precision(y), jnp.max(jnp.diagonal(covariance))
+    W = precision(y)
+    # Eigenvalues of at least the floor: max(λ, floor) = floor + max(λ − floor, 0).
+    prior = jnp.max(jnp.diagonal(covariance))
     floor = _FLAT / prior * jnp.eye(len(W), dtype=W.dtype)
     R = _root(floor + positive_part(W - floor))
-    guiding = _Guiding(
-        y.reshape(mean.shape), R.T, R.T @ y + solve_lower(R, slope), jnp.zeros_like(value)
-    )
+    # L = Rᵀ, so that Lᵀ L = W, and v = L y + L⁻ᵀ ∇log ψ(y) gives ψ̃ the slope of ψ at y.
+    observed_by_it = R.T @ y + solve_lower(R, slope)
+    guiding = _Guiding(y.reshape(mean.shape), R.T, observed_by_it, jnp.zeros_like(value))
+    # The scale gives it the value too, so that log ψ − log ψ̃ is 0 there, with its slope.
     log_scale = value - guiding.log_density(y)
     return eqx.tree_at(lambda g: g.log_scale, guiding, log_scale), (value, slope)
 
@@ -342,8 +358,10 @@ def _root(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def _mode(
     log_density: Callable, precision: Callable, mean: Float[Array, " N"], root: Float[Array, "N N"]
 ):
-    """The ξ of the largest log ψ(m + S ξ) − ½ |ξ|², by Gauss and Newton; its derivatives by the
-    implicit function.
+    """The ξ of the largest log ψ(m + S ξ) − ½ |ξ|², by Gauss and Newton.
+
+    In ξ the law is standard, so that no inverse of its covariance is needed. Derivatives are those
+    of the implicit function, not of the iterations.
     """
 
     def loss(xi):
@@ -353,6 +371,8 @@ def _mode(
         return xi - root.T @ jax.grad(log_density)(mean + root @ xi)
 
     def step(_, xi):
+        # The best of a step and its halves, none of which is taken if it makes things worse; a NaN
+        # is passed over.
         H = jnp.eye(len(xi), dtype=xi.dtype) + root.T @ precision(mean + root @ xi) @ root
         factor = jnp.linalg.cholesky(H)
         direction = solve_lower(factor, solve_lower(factor, slope(xi)), transposed=True)
@@ -372,6 +392,7 @@ def _mode(
         return jax.lax.fori_loop(0, _POLISHINGS, polish, xi)
 
     def tangent_solve(linear, y):
+        # `linear` is the Jacobian of `slope`, as a function: its columns are its values at e_i.
         matrix = jax.vmap(linear, out_axes=1)(jnp.eye(len(y), dtype=y.dtype))
         return jnp.linalg.solve(matrix, y)
 
@@ -391,8 +412,11 @@ def positive_part(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 @positive_part.defjvp
 def _(primals, tangents):
-    (S,), (dS,) = primals, tangents
+    (S,) = primals
+    (dS,) = tangents
     values, vectors = jnp.linalg.eigh(0.5 * (S + S.T))
+    # With f(λ) = max(λ, 0) and S = V diag(λ) Vᵀ: d f(S) = V (Q ∘ Vᵀ dS V) Vᵀ,
+    # Q_ij = (f(λ_i) − f(λ_j))/(λ_i − λ_j), and f'(λ_i) where eigenvalues are equal to rounding.
     kept = jnp.maximum(values, 0.0)
     gap = values[:, None] - values[None, :]
     same = jnp.abs(gap) <= 1e-6 * jnp.max(jnp.abs(values))

@@ -1,5 +1,4 @@
-"""Matches that are functions of a distance in the H-norm: of heavy tails, and to a shape wherever
-it lies.
+"""Matches by a distance in the H-norm: with heavy tails, and to a shape wherever it lies.
 
 With r² = Σ_i w_i |x_i − v_i|² / variance, m numbers in all and w the weights of the space,
 
@@ -85,21 +84,23 @@ class HuberMatch(AbstractDensityMatch):
 
     @property
     def spread(self):
+        # An exponential tail is heavier than every normal one. How wide a mixture leads paths is a
+        # choice: weights are right for any.
         return jnp.asarray(1.0)
 
     def log_density(self, sde, x, observed):
         square, log_scale = _square(self.variance, sde, x, observed)
-        k, m = self.threshold.astype(x.dtype), x.size
+        k = self.threshold.astype(x.dtype)
+        m = x.size
         far = square > k * k
+        # √ has no slope at 0: it is asked for where r is beyond k only.
         distance = jnp.sqrt(jnp.where(far, square, 1.0))
         loss = jnp.where(far, k * distance - 0.5 * k * k, 0.5 * square)
-        # the integral over R^m in spherical coordinates, r < k and r > k
+        # 1/c is the integral over R^m in spherical coordinates: the area of the sphere times
+        #     ∫₀^k r^{m−1} e^{−r²/2} dr      and      ∫_k^∞ r^{m−1} e^{−k r + k²/2} dr.
         area = jnp.log(2.0) + 0.5 * m * _LOG_PI - gammaln(0.5 * m)
-        inner = (
-            (0.5 * m - 1) * jnp.log(2.0)
-            + gammaln(0.5 * m)
-            + jnp.log(gammainc(0.5 * m, 0.5 * k * k))
-        )
+        within = jnp.log(gammainc(0.5 * m, 0.5 * k * k))
+        inner = (0.5 * m - 1) * jnp.log(2.0) + gammaln(0.5 * m) + within
         outer = 0.5 * k * k - m * jnp.log(k) + gammaln(1.0 * m) + jnp.log(gammaincc(1.0 * m, k * k))
         return -loss - log_scale - area - jnp.logaddexp(inner, outer)
 
@@ -107,9 +108,8 @@ class HuberMatch(AbstractDensityMatch):
         square, _ = _square(self.variance, sde, x, observed)
         k = self.threshold.astype(x.dtype)
         far = square > k * k
-        return _reweighted(
-            jnp.where(far, k / jnp.sqrt(jnp.where(far, square, 1.0)), 1.0), self.variance, sde, x
-        )
+        weight = jnp.where(far, k / jnp.sqrt(jnp.where(far, square, 1.0)), 1.0)
+        return _reweighted(weight, self.variance, sde, x)
 
 
 class ProcrustesMatch(AbstractDensityMatch):
@@ -139,10 +139,13 @@ class ProcrustesMatch(AbstractDensityMatch):
             "`x0` must hold points in the plane or in space, (n, 2) or (n, 3); got a state "
             f"{x.shape} of {sde.space}.",
         )
+        # The best translation takes mean to mean. What is left, over rotations R and scales s, is
+        # |x|² + s² |v|² − 2 s tr(R vᵀ x): the largest trace, and then s = tr/|v|².
         weights = _weights(sde, x)
         v = _centred(weights, _like(observed, x))
         x = _centred(weights, x)
-        own, other = jnp.sum(x * x), jnp.sum(v * v)
+        own = jnp.sum(x * x)
+        other = jnp.sum(v * v)
         if self.up_to == "translation":
             square = jnp.sum((x - v) ** 2)
         elif self.up_to == "rigid":
@@ -155,7 +158,10 @@ class ProcrustesMatch(AbstractDensityMatch):
 def _largest_trace(A: Float[Array, "d d"]) -> Float[Array, ""]:
     """max tr(R A) over rotations R."""
     if len(A) == 2:
+        # tr(R A) = (A₀₀ + A₁₁) cos φ + (A₀₁ − A₁₀) sin φ, or with the other sign of φ
         return jnp.sqrt((A[0, 0] + A[1, 1]) ** 2 + (A[0, 1] - A[1, 0]) ** 2)
+    # Over all orthogonal R it is Σ s; where that is reached by a reflection, the smallest
+    # singular value changes its sign (Kabsch).
     U, s, Vt = jnp.linalg.svd(A)
     return jnp.sum(s) - (1 - jnp.linalg.det(U @ Vt)) * s[-1]
 
@@ -182,9 +188,9 @@ def _square(variance, sde: AbstractSDE, x: State, observed: State):
 
 
 def _reweighted(weight: Array, variance: Array, sde: AbstractSDE, x: State) -> Float[Array, "N N"]:
-    """The precision of least squares that are weighted again and again: ψ' of the slope, the same
-    in all directions.
-    """
+    """The precision of least squares that are weighted again and again, alike in all directions."""
+    # The loss ρ(r) has slope `weight` · r: the parabola of that slope, which lies above ρ, has the
+    # curvature `weight`. It is positive also where ρ itself bends the other way.
     precision = weight * _weights(sde, x) / variance.astype(x.dtype)
     return jnp.diag(jnp.repeat(precision, x.size // x.shape[0]))
 

@@ -40,6 +40,7 @@ def fused(
     along a leading axis; `x`: a state.
     """
     owner = np.repeat(np.arange(len(sizes)), sizes)
+    # `at` fills in what a mask hides; data were checked before.
     values = jax.vmap(lambda match, v: match.at(v).observed, in_axes=(0 if own else None, 0))(
         match, values
     )
@@ -59,12 +60,16 @@ def fused(
 def _of_one_match(
     seen: Observation, values, owner, sizes, total: Callable[[Array], Array]
 ) -> AbstractCondition:
-    count, one_factor = jnp.asarray(sizes, values.dtype), seen.factor
+    """v is the mean of r values, Σ = Σ_1 / r, and the constant is had where L x is that mean."""
+    count = jnp.asarray(sizes, values.dtype)
+    one_factor = seen.factor
     assert one_factor is not None
     mean = total(values) / rows(count, values)
-    density = jax.vmap(lambda r: gaussian_log_density(r, one_factor) + seen.log_scale)(
-        values - mean[owner]
-    )
+
+    def log_density(r):
+        return gaussian_log_density(r, one_factor) + seen.log_scale
+
+    density = jax.vmap(log_density)(values - mean[owner])
     factor = jax.vmap(lambda r: one_factor / jnp.sqrt(r))(count)
     constant = total(density) - jax.vmap(gaussian_log_density)(jnp.zeros_like(mean), factor)
     operator = jnp.broadcast_to(seen.operator, (len(sizes), *seen.operator.shape))
@@ -80,38 +85,46 @@ def _independent(
     operator, factor = (
         a.reshape(a.shape + (1,) * (ndim - a.ndim)) for a in (seen.operator, seen.factor)
     )
+    # Diagonal operators are masks, of zeros and ones: L v = v where something is seen.
     precision = (operator / factor) ** 2
     together = total(precision)
     there = together > 0
+    # Where nothing is seen the operator is 0, and any variance will do.
     together = jnp.where(there, together, 1.0)
     weighted = total(jax.vmap(apply)(precision, values))
     mean = jax.vmap(lambda h, f: apply(1 / h, f))(together, weighted)
-    fused_seen = Observation(
-        there.astype(x.dtype), 1 / jnp.sqrt(together), jnp.zeros(len(together), x.dtype)
-    )
+    zeros = jnp.zeros(len(together), x.dtype)
+    fused_seen = Observation(there.astype(x.dtype), 1 / jnp.sqrt(together), zeros)
     return _with_constant(seen, values, owner, total, fused_seen, mean, mean)
 
 
 def _dense(
     seen: Observation, values, owner, total: Callable[[Array], Array], x: State
 ) -> AbstractCondition:
-    n, one = x.shape[0], jnp.ones((), x.dtype)
-    # operators may leave directions open
+    """v = R⁻¹ F and L = Rᵀ with R Rᵀ = H = Σ_i L_iᵀ Σ_i⁻¹ L_i, F = Σ_i L_iᵀ Σ_i⁻¹ v_i."""
+    n = x.shape[0]
+    one = jnp.ones((), x.dtype)
+    # Operators may leave directions open, where H has no factor without it.
     nugget = 10 * n * jnp.finfo(x.dtype).eps if seen.operator.ndim == 3 else 0.0
 
     def information(operator, factor, v):
         H, F, _ = GaussianMessage(operator, jnp.zeros_like(v), factor, v, 0 * one).information(n)
         return H, F.reshape(x.shape)
 
+    def root(H):
+        jitter = nugget * jnp.max(jnp.diagonal(H)) * jnp.eye(n, dtype=x.dtype)
+        return cholesky(H + jitter)
+
     def pull(around):
+        """H, and F of the residuals at a state, which is small near the data."""
         residual = values - jax.vmap(apply)(seen.operator, around[owner])
         return jax.tree.map(total, jax.vmap(information)(seen.operator, seen.factor, residual))
 
     start = jnp.broadcast_to(x, (owner[-1] + 1, *x.shape))
     H, F = pull(start)
-    R = jax.vmap(
-        lambda H: cholesky(H + nugget * jnp.max(jnp.diagonal(H)) * jnp.eye(n, dtype=x.dtype))
-    )(H)
+    R = jax.vmap(root)(H)
+    # H⁻¹ F leads to the best state. From there F is nearly 0, and v = R⁻¹ F + Rᵀ y keeps digits
+    # that a sum of large values would lose.
     near = start + jax.vmap(lambda R, F: solve_lower(R, solve_lower(R, F), transposed=True))(R, F)
     _, F = pull(near)
     operator = R.transpose(0, 2, 1)
@@ -130,7 +143,6 @@ def _with_constant(
     def log_density(seen, v, x):
         return gaussian_log_density(v - apply(seen.operator, x), seen.factor) + seen.log_scale
 
-    constant = total(jax.vmap(log_density)(seen, values, near[owner])) - jax.vmap(log_density)(
-        one, value, near
-    )
+    product = total(jax.vmap(log_density)(seen, values, near[owner]))
+    constant = product - jax.vmap(log_density)(one, value, near)
     return _Seen(_Fused(Observation(one.operator, one.factor, constant)), value)

@@ -53,11 +53,13 @@ class _Seen(AbstractCondition):
         )
         m = operator.shape[0] if operator.ndim == 2 else n
         shape = (m, *x.shape[1:])
+        # Exactly: a datum with an axis more would broadcast against the state, and weigh a sum.
         require(
             self.observed.shape == shape,
             f"`observed` must have shape {shape} for a state {x.shape}; got {self.observed.shape}. "
             "Several observations need a batch: `vmap`, or a plate with one noise each.",
         )
+        # What a match checks when it meets a state, without computing it.
         jax.eval_shape(lambda: self.match.observation(sde, x))
 
     def observation(self, sde, x):
@@ -122,6 +124,7 @@ class ExactMatch(AbstractMatch):
                 "array. Give a NumPy array, or use InexactMatch.",
             )
             keep = _mask(mask)
+            # An exact match has no variance to make infinite: what is hidden has no row.
             require(keep.any(), "`mask` must leave at least one row to be seen; got all False.")
             operator = np.eye(len(keep))[keep]
         self.operator = _operator(operator)
@@ -141,8 +144,9 @@ class ExactMatch(AbstractMatch):
 
 
 class InexactMatch(AbstractMatch):
-    """The end state is seen with Gaussian noise of a given variance in the H-norm, exp(−‖L X_T −
-    v‖²_H / 2 variance).
+    """The end state is seen with Gaussian noise of a given variance in the H-norm.
+
+    Its density is proportional to exp(−‖L X_T − v‖²_H / 2 variance).
 
     With quadrature weights w the noise of point i has variance `variance / w_i`: on a curve of n
     points the same `variance` gives the same likelihood as n grows.
@@ -197,6 +201,7 @@ class InexactMatch(AbstractMatch):
                 self.variance, "variance", "For an observation without noise use ExactMatch."
             )
         elif concrete(self.variance) is not None:
+            # The factorisation reads one triangle only, so symmetry is asked for by itself.
             factor = cholesky(self.variance)
             require(
                 jnp.all(jnp.isfinite(factor)) & jnp.allclose(self.variance, self.variance.T),
@@ -211,8 +216,9 @@ class InexactMatch(AbstractMatch):
 
     @classmethod
     def from_point_sd(cls, sd, space: AbstractSpace, **kwargs) -> "InexactMatch":
-        """From the standard deviation of one coordinate of one point (of average weight): variance
-        = sd² · mean(w).
+        """From the standard deviation of one coordinate of one point, of average weight.
+
+        variance = sd² · mean(w).
         """
         sd = as_float(sd, "sd")
         require_positive(sd, "sd", "For an observation without noise use ExactMatch.")
@@ -230,7 +236,8 @@ class InexactMatch(AbstractMatch):
         space = sde.space if self.space is None else self.space
         if space is None:
             return None
-        weights, n = space.weights.astype(x.dtype), x.shape[0]
+        weights = space.weights.astype(x.dtype)
+        n = x.shape[0]
         m = self.operator.shape[0] if self.operator.ndim == 2 else n
         own = self.space is not None and weights.shape == (m,)
         require(
@@ -243,15 +250,16 @@ class InexactMatch(AbstractMatch):
         others = weights if own else jnp.ones((m,), x.dtype)
         if weights.shape != (n,):
             return others
+        # A selection of points keeps their weights. By `where` and no `if`: an operator may be
+        # traced, and means the same then.
         picked = self.operator == 1
-        is_selection = jnp.all(picked | (self.operator == 0)) & jnp.all(
-            jnp.sum(picked, axis=1) == 1
-        )
-        return jnp.where(
-            is_selection, jnp.sum(jnp.where(picked, weights[None], 0.0), axis=1), others
-        )
+        is_binary = jnp.all(picked | (self.operator == 0))
+        is_selection = is_binary & jnp.all(jnp.sum(picked, axis=1) == 1)
+        kept = jnp.sum(jnp.where(picked, weights[None], 0.0), axis=1)
+        return jnp.where(is_selection, kept, others)
 
     def _factor(self, sde: AbstractSDE, x: State) -> Structured:
+        """P with P Pᵀ = W^{-½} variance W^{-½}: in the H-norm a row counts by its weight."""
         m = self.operator.shape[0] if self.operator.ndim == 2 else x.shape[0]
         variance = symmetric(self.variance.astype(x.dtype))
         require(
@@ -261,15 +269,19 @@ class InexactMatch(AbstractMatch):
         )
         weights = self._weights(sde, x)
         if weights is not None:
-            variance = (
-                congruence(1 / jnp.sqrt(weights), variance) if variance.ndim else variance / weights
-            )
+            if variance.ndim:
+                variance = congruence(1 / jnp.sqrt(weights), variance)
+            else:
+                variance = variance / weights
         return cholesky(variance)
 
     def observation(self, sde: AbstractSDE, x: State) -> Observation:
         factor = self._factor(sde, x)
         operator = self.operator.astype(x.dtype)
         m = operator.shape[0] if operator.ndim == 2 else x.shape[0]
+        # ½ log 2π + log P_ii of each row: what makes exp(−½ |P⁻¹ r|²) a density. `log_scale` gives
+        # it back where there is to be none: for the kernel, and for rows that a mask hides, which
+        # the operator sees as 0 with the datum 0.
         rows = jnp.full((m,), 0.5 * _LOG_2PI, x.dtype) + jnp.log(diagonal(factor, m))
         if self.mask is not None:
             require(
@@ -316,6 +328,7 @@ def _operator(operator) -> Structured:
     )
     if value is not None:
         require_finite(value, "operator")
+        # Of dependent rows a datum is impossible, or one of them tells nothing.
         require(
             np.linalg.matrix_rank(value) == len(value),
             f"`operator` must have independent rows; its rank is below its {operator.shape[0]} "
@@ -354,6 +367,7 @@ def _datum(observed, mask=None) -> State:
             v.shape[:1] == mask.shape,
             f"`observed` must have {mask.shape[0]} rows, like `mask`; got shape {v.shape}.",
         )
+        # 0 is what the operator of a mask makes of a hidden row; a NaN would stay one in 0 · NaN.
         v = jnp.where(mask.reshape(mask.shape + (1,) * (v.ndim - 1)), v, 0.0)
     require_finite(
         v, "observed", "Missing points are declared by `mask=` or left out by `operator=`."

@@ -1,5 +1,4 @@
-"""A Gaussian message: a linear observation of a state with Gaussian noise, as a function of the
-state.
+"""A Gaussian message: a linear observation with Gaussian noise, as a function of the state.
 
     h(x) = exp(log_scale) N(v; L x + shift, P Pᵀ ⊗ I_dim)
 
@@ -44,19 +43,19 @@ class GaussianMessage(eqx.Module):
 
     def log_value(self, x: State) -> Float[Array, ""]:
         """log h(x)."""
-        return self.log_scale + gaussian_log_density(
-            self.observed - self.shift - apply(self.operator, x), self.factor
-        )
+        # Not by `residual`: where P has no variance the density asks for the difference itself.
+        difference = self.observed - self.shift - apply(self.operator, x)
+        return self.log_scale + gaussian_log_density(difference, self.factor)
 
     def score(self, x: State) -> State:
         """∇ log h(x) = Lᵀ (P Pᵀ)⁻¹ (v − L x − shift)."""
-        return apply(
-            transpose(self.operator), solve_lower(self.factor, self.residual(x), transposed=True)
-        )
+        pull = solve_lower(self.factor, self.residual(x), transposed=True)
+        return apply(transpose(self.operator), pull)
 
     def information(self, n: int) -> tuple[Float[Array, "n n"], State, Float[Array, ""]]:
         """H, F and c with log h(x) = c + Fᵀx − ½ xᵀHx, for states of n rows."""
         m = self.observed.shape[0]
+        # H = (P⁻¹ L)ᵀ (P⁻¹ L) and F = (P⁻¹ L)ᵀ P⁻¹ (v − shift); c is log h(0).
         root = solve_lower(promote(self.factor, 2, m), promote(self.operator, 2, n))
         v = solve_lower(self.factor, self.observed - self.shift)
         return root.T @ root, root.T @ v, self.log_scale + whitened_log_density(v, self.factor)
@@ -64,6 +63,8 @@ class GaussianMessage(eqx.Module):
 
 def gaussian_log_density(r: State, factor: Structured) -> Float[Array, ""]:
     """log N(r; 0, P Pᵀ); −inf where a coordinate of r has no variance and is not 0."""
+    # A factor without variance has a row of zeros there; with 1 on its diagonal the solve goes
+    # through, and the other coordinates do not feel it.
     empty = without_variance(factor)
     factor = filled(factor, empty)
     return where_possible(r, empty, whitened_log_density(solve_lower(factor, r), factor))
@@ -82,5 +83,7 @@ def where_possible(r: State, empty: Array, log_value: Float[Array, ""]) -> Float
 
 def whitened_log_density(y: State, factor: Structured) -> Float[Array, ""]:
     """log N(r; 0, P Pᵀ) from y = P⁻¹ r."""
-    m, dim = y.shape[0], columns(y)
+    m = y.shape[0]
+    dim = columns(y)
+    # All columns share P, so its determinant counts `dim` times.
     return -0.5 * jnp.sum(y * y) - dim * (log_diagonal(factor, m) + 0.5 * m * _LOG_2PI)

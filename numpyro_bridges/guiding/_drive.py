@@ -33,7 +33,9 @@ def drive(
 
 
 def _forward(A, S, M, r, z):
-    N, P = cholesky(S), cholesky(M)
+    N = cholesky(S)
+    P = cholesky(M)
+    # N + P is triangular too, so (N + P)⁻¹ costs one solve and no factorisation of its own.
     g = solve_lower(N + P, A @ z)
     y = solve_lower(N, r)
     w = solve_lower(N, y - g, transposed=True)
@@ -47,16 +49,27 @@ def _(primals, tangents):
     A, S, M, r, z = primals
     dA, dS, dM, dr, dz = tangents
     out, (N, P, y, g, w) = _forward(A, S, M, r, z)
-    F_N, F_P = _factor_change(N, dS), _factor_change(P, dM)
-    Fy, Fg, FTh = _times(F_N, y), _times(F_N, g), _times(F_N.T, y - g)
+    F_N = _factor_change(N, dS)
+    F_P = _factor_change(P, dM)
+    # F as it is applied, to a few columns
+    Fy = _times(F_N, y)
+    Fg = _times(F_N, g)
+    FTh = _times(F_N.T, y - g)
+    # (N + P) g = A z, so (N + P) dg = dA z + A dz − (dN + dP) g
     dg = solve_lower(N + P, dA @ z + A @ dz - N @ Fg - P @ _times(F_P, g))
+    # N y = r, so dy = N⁻¹ dr − F y, and h = y − g
     dh = solve_lower(N, dr) - Fy - dg
+    # Nᵀ w = h, so dw = N⁻ᵀ (dh − dNᵀ w) with dNᵀ w = Fᵀ Nᵀ w = Fᵀ h
     dw = solve_lower(N, dh - FTh, transposed=True)
-    return out, (dz + dA.T @ w + A.T @ dw, jnp.trace(F_P) - jnp.trace(F_N))
+    # u = z + Aᵀ w, and d log|N| = tr(N⁻¹ dN) = tr F
+    du = dz + dA.T @ w + A.T @ dw
+    return out, (du, jnp.trace(F_P) - jnp.trace(F_N))
 
 
 def _factor_change(L, dS):
     """L⁻¹ dL of the factor of S = L Lᵀ."""
+    # X = L⁻¹ dS L⁻ᵀ by two solves from the right: dS is symmetric, so the second takes the
+    # transpose of the first and no transpose is needed after it.
     half = lax.linalg.triangular_solve(L, dS, left_side=False, lower=True, transpose_a=True)
     X = lax.linalg.triangular_solve(L, half.T, left_side=False, lower=True, transpose_a=True)
     i = jnp.arange(L.shape[0])
@@ -66,7 +79,5 @@ def _factor_change(L, dS):
 
 
 def _times(F, x):
-    """F x for a few columns, without a `dot`: the transposes, outer products, become one loop over
-    F.
-    """
+    """F x for a few columns, without a `dot`: its transpose, outer products, is one loop over F."""
     return jnp.sum(F[:, :, None] * x[None, :, :], axis=1)

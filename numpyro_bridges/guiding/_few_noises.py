@@ -6,11 +6,10 @@ the time left after it. With r = v − x,
     C = Gᵀ E⁻¹ G,      f = Gᵀ E⁻¹ r,      H = (I + κ C)⁻¹ C,
 
 the law of u given v is N(Π⁻¹ s (I + κ C)⁻¹ f, Π⁻¹), Π = I + s² H, and all matrices are k × k. E is
-what no path changes: errors that are independent, and what is bridged by a covariance of the end, E
-= D + λ F Fᵀ, D diagonal. With N Nᵀ = I + λ Fᵀ D⁻¹ F
+what no path changes: errors that are independent, and what is bridged by a covariance of the end,
+E = D + λ F Fᵀ, D diagonal. With N Nᵀ = I + λ Fᵀ D⁻¹ F
 
-    E⁻¹ = D⁻¹ − λ D⁻¹ F N⁻ᵀ N⁻¹ Fᵀ D⁻¹
-    (Woodbury).
+    E⁻¹ = D⁻¹ − λ D⁻¹ F N⁻ᵀ N⁻¹ Fᵀ D⁻¹                                          (Woodbury).
 """
 
 import equinox as eqx
@@ -33,9 +32,7 @@ from ._steering import AbstractSteering, log_ratio
 
 
 def are_few(sigma: Structured, num_values: int) -> bool:
-    """Whether so many noises are fewer than these values by so much that their algebra is the
-    cheaper one.
-    """
+    """Whether noises are fewer than values by so much that their algebra is the cheaper one."""
     return sigma.ndim == 2 and 2 * sigma.shape[1] <= num_values
 
 
@@ -76,10 +73,16 @@ class LowRank(eqx.Module):
     """Of I + κ C."""
 
     def __init__(self, errors: Errors, end_scale, factor: Float[Array, "m k"], scale):
-        self.errors, self.end_scale, self.scale = errors, end_scale, scale
+        self.errors = errors
+        self.end_scale = end_scale
+        self.scale = scale
+        # All is in units of the errors, D^{-½} on the left of every m-vector, so that E is the
+        # identity but for F.
         self.factor = solve_lower(errors.sd, factor)
-        self.gram, self.across = self.factor.T @ self.factor, None
+        self.across = None
+        self.gram = self.factor.T @ self.factor
         if errors.factor is not None:
+            # C = Gᵀ D⁻¹ G − λ (N⁻¹ Fᵀ D⁻¹ G)ᵀ (N⁻¹ Fᵀ D⁻¹ G)
             self.across = solve_lower(self._end_root, errors.factor.T @ self.factor)
             self.gram = self.gram - end_scale * (self.across.T @ self.across)
         self.root = self._plus_identity(scale * self.gram)
@@ -88,6 +91,8 @@ class LowRank(eqx.Module):
     def _plus_identity(S):
         return cholesky(add(S, jnp.ones((), S.dtype)))
 
+    # A property and no field: it depends on λ, which may differ from step to step, and a plan is
+    # made for all steps.
     @property
     def _end_root(self):
         """N."""
@@ -99,6 +104,7 @@ class LowRank(eqx.Module):
         r = solve_lower(self.errors.sd, r)
         f = apply(transpose(self.factor), r)
         if self.across is not None:
+            # f = Gᵀ D⁻¹ r − λ (N⁻¹ Fᵀ D⁻¹ G)ᵀ N⁻¹ Fᵀ D⁻¹ r
             assert self.errors.factor is not None
             back = solve_lower(self._end_root, apply(transpose(self.errors.factor), r))
             f = f - self.end_scale * apply(transpose(self.across), back)
@@ -107,13 +113,17 @@ class LowRank(eqx.Module):
     def information(self) -> Float[Array, "k k"]:
         """H."""
         H = solve_lower(self.root, solve_lower(self.root, self.gram), transposed=True)
+        # It is symmetric but for rounding, and is factorised.
         return 0.5 * (H + H.T)
 
     def solve(self, r: State) -> State:
         """(E + κ G Gᵀ)⁻¹ r."""
-        sd, F = self.errors.sd, self.errors.factor
+        sd = self.errors.sd
+        F = self.errors.factor
+        # Woodbury once more: E⁻¹ (r − κ G (I + κ C)⁻¹ f).
         left = solve_lower(sd, r) - self.scale * apply(self.factor, self.pull(r))
         if F is not None:
+            # E⁻¹ in units of the errors, 1 − λ F N⁻ᵀ N⁻¹ Fᵀ
             N = self._end_root
             back = solve_lower(N, solve_lower(N, apply(transpose(F), left)), transposed=True)
             left = left - self.end_scale * apply(F, back)
@@ -128,8 +138,9 @@ class LowRank(eqx.Module):
 
 
 class NoiseSteering(AbstractSteering):
-    """The conditional law of u given v, whose difference r to its forecast at the step's mean is s
-    G u and an error.
+    """The conditional law of u given v, where r, v less its forecast at the mean, is s G u + error.
+
+    u = Q⁻ᵀ (Q⁻¹ s (I + κ C)⁻¹ f + z): both parts of N(Π⁻¹ s (I + κ C)⁻¹ f, Π⁻¹) by one solve.
     """
 
     covariance: LowRank
@@ -142,7 +153,9 @@ class NoiseSteering(AbstractSteering):
     """Q⁻¹ s (I + κ C)⁻¹ f."""
 
     def __init__(self, covariance: LowRank, step, r: State):
-        self.covariance, self.step, self.r = covariance, step, r
+        self.covariance = covariance
+        self.step = step
+        self.r = r
         self.factor = cholesky(add(step**2 * covariance.information(), jnp.ones((), r.dtype)))
         self.pull = solve_lower(self.factor, step * covariance.pull(r))
 
@@ -151,6 +164,7 @@ class NoiseSteering(AbstractSteering):
 
     def drive(self, z):
         u = solve_lower(self.factor, self.pull + z, transposed=True)
+        # B = Q⁻ᵀ, so log|B| = −log|Q| for each column.
         return u, log_ratio(z, u) - columns(z) * log_diagonal(self.factor, len(u))
 
     def inverse(self, u):
@@ -162,7 +176,10 @@ class NoiseSteering(AbstractSteering):
 
         By what is left of r at the mean, whose digits are those of the errors.
         """
-        u, sd = self.mean(), self.covariance.errors.sd
+        # log p(v) = log p(v | u) + log p(u) − log p(u | v) at any u: at the mean of u given v the
+        # last is that of a normal at its mean, and log 2π cancels.
+        u = self.mean()
+        sd = self.covariance.errors.sd
         left = solve_lower(sd, self.r) - self.step * apply(self.covariance.factor, u)
         return (
             whitened_log_density(left, sd)

@@ -1,5 +1,4 @@
-"""A guide that follows geodesics: one step of Newton's method from the straight line towards the
-path of least energy.
+"""A guide that follows geodesics: a step of Newton's method from the straight line towards one.
 
 For small noise −log h is the energy of the path that the Hamiltonian
 
@@ -67,8 +66,10 @@ class GeodesicGuide(AbstractGuide):
     def plan(self, sde, seen, reference, ts, beyond=0.0):
         receding = self.receding.plan(sde, seen, reference, ts, beyond)
         if not isinstance(receding, RecedingPlan):
-            return receding
+            return receding  # where a is constant a straight line is the geodesic
         here = (receding.steps, ts[:-1], ts[-1] + beyond - ts[:-1])
+        # A step is corrected by the geodesic from its start, so an entry has that of the time
+        # before beside its own; the first one, at t0, ends no step.
         before = jax.tree.map(lambda a: jnp.concatenate([a[:1], a[:-1]]), here)
         return _GeodesicPlan((here, before), receding, sde, self.correction)
 
@@ -83,18 +84,20 @@ class _GeodesicPlan(AbstractPlan):
     def steer(self, step, transition, dt, x, observed):
         here, before = step
         miss, _ = self._miss(before, per_time(transition, dt), x, observed)
-        return self.receding.steer(
-            here[0], transition, dt, x, observed + self.correction_part * miss
-        )
+        moved = observed + self.correction_part * miss
+        return self.receding.steer(here[0], transition, dt, x, moved)
 
     def message(self, step, sde, t, x, observed):
+        # The uncorrected one: its value is a density of the datum, as that of a moved one is not.
         return self.receding.message(step[0][0], sde, t, x, observed)
 
     def correction(self, step, x):
         here, _ = step
         noise = self.sde.noise(here[1], x)
         operator, shift, _ = self.receding.forecast(here[0], noise)
+        # In displacements what is observed is 0.
         miss, solve = self._miss(here, noise, x, jnp.zeros_like(shift))
+        # A target that is moved by δ moves the score by Lᵀ S⁻¹ δ.
         return apply(transpose(operator), solve(self.correction_part * miss))
 
     def _miss(self, entry, noise, x, observed):
@@ -102,6 +105,7 @@ class _GeodesicPlan(AbstractPlan):
         step, t, left = entry
         operator, shift, covariance = self.receding.forecast(step, noise)
         solve = _solver(covariance)
+        # λ = S⁻¹ r of the receding guide, and its momentum p = Λᵀ λ, the score
         r = observed - shift - apply(operator, x)
         momentum = solve(r)
 
@@ -110,17 +114,23 @@ class _GeodesicPlan(AbstractPlan):
 
         slopes = jax.grad(hamiltonian, (0, 1))
         p = apply(transpose(operator), momentum)
+        # One midpoint step over all the time left: x' = ∂H/∂p, p' = −∂H/∂x. A guide need not be
+        # exact, and what the step leaves out costs variance, no bias.
         dp, dx = slopes(x, p)
         dp, dx = slopes(x + 0.5 * left * dx, p - 0.5 * left * dp)
-        x, p = x + left * dx, p - left * dp
-        L, error = self.receding.seen.operator, self.receding.seen.covariance
+        x = x + left * dx
+        p = p - left * dp
+        # λ̂ with p̂ = Lᵀ λ̂, row by row; of a general L, whose rows p̂ may have left, λ is kept.
+        L = self.receding.seen.operator
+        error = self.receding.seen.covariance
         if L.ndim < 2:
             momentum = apply(jnp.where(L == 0, 0.0, 1 / jnp.where(L == 0, 1.0, L)), p)
         miss = observed - apply(L, x) - apply(error, momentum)
+        # Damped where it is longer than the way to go, both in the metric S⁻¹. At the target there
+        # is no way to go: the double `where` keeps 0/0 out of the derivative.
         to_go = jnp.sum(r * solve(r))
-        excess = jnp.where(
-            to_go > 0, jnp.sum(miss * solve(miss)) / jnp.where(to_go > 0, to_go, 1.0), 0.0
-        )
+        ratio = jnp.sum(miss * solve(miss)) / jnp.where(to_go > 0, to_go, 1.0)
+        excess = jnp.where(to_go > 0, ratio, 0.0)
         return miss / (1 + (0.5 * excess) ** 2), solve
 
 
@@ -128,6 +138,7 @@ def _solver(covariance: Structured | LowRank) -> Callable[[State], State]:
     """Its inverse."""
     if isinstance(covariance, LowRank):
         return covariance.solve
+    # What has no variance is forecast exactly, or out of reach: any variance may stand for it.
     factor = cholesky(filled(covariance, without_variance(covariance)))
     return lambda r: solve_lower(factor, solve_lower(factor, r), transposed=True)
 
@@ -142,5 +153,7 @@ def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:
     rounds = 2 if isinstance(sde, SemilinearSDE) else 0
     if sde.has_constant_covariance(x):
         return FrozenGuide(rounds=rounds)
+    # B is a number for flows, and for states too large for a Jacobian, whose drift no guide knows.
+    # Only its shape is asked for: nothing is computed, and traced parameters will do.
     operator = jax.eval_shape(lambda: sde.linearised_drift(jnp.zeros((), x.dtype), x)[0])
     return GeodesicGuide() if operator.ndim == 0 and rounds == 0 else RecedingGuide(rounds=rounds)

@@ -4,8 +4,8 @@
 the cheap work of one step. A guide may know the parameters, the data and the path so far, never
 later noise.
 
-The backward filter in covariance form: with the auxiliary process's steps x' ~ N(Φ x + φ, C) and v
-= L x_K + N(0, Σ), the forecast of v from x_k is N(Λ_k x_k + s_k, M_k),
+The backward filter in covariance form: with the auxiliary process's steps x' ~ N(Φ x + φ, C) and
+v = L x_K + N(0, Σ), the forecast of v from x_k is N(Λ_k x_k + s_k, M_k),
 
     Λ_K = L,  s_K = 0,  M_K = Σ;
     Λ_k = Λ_{k+1} Φ_k,   s_k = s_{k+1} + Λ_{k+1} φ_k,   M_k = M_{k+1} + Λ_{k+1} C_k Λ_{k+1}ᵀ.
@@ -38,14 +38,14 @@ from ._few_noises import Errors, LowRank, NoiseSteering, are_few
 from ._steering import AbstractSteering, DriftSteering, GaussianSteering
 
 _MAX_DENSE = 16
-"""Largest n for which the receding guide keeps a full matrix drift; beyond it the drift's diagonal
-guides.
-"""
+"""Largest n for which the receding guide keeps a drift's full matrix, and not its diagonal only."""
 
 
 class AbstractPlan(eqx.Module):
-    """What a guide has prepared for a grid: `steps` has a leading axis, one entry per grid time but
-    the last.
+    """What a guide has prepared for a grid.
+
+    `steps` is a pytree of arrays with a leading axis, one entry per grid time but the last. A loop
+    hands `steer` the entry of the time at which its step ends. `AbstractGuide` has an example.
     """
 
     steps: eqx.AbstractVar[Any]
@@ -68,7 +68,31 @@ class AbstractPlan(eqx.Module):
 
 
 class AbstractGuide(eqx.Module):
-    """A way to lead paths to what is observed."""
+    """A way to lead paths to what is observed. A subclass gives `plan`.
+
+    Any plan gives unbiased weights; one that forecasts the observation better gives weights of less
+    spread. A plan may know parameters, data and the path so far, never later noise. This one
+    freezes the covariance halfway between a start, which it holds, and the observed end:
+
+        class HalfwayGuide(nb.AbstractGuide):
+            start: Array
+
+            def plan(self, sde, seen, reference, ts):
+                halfway = 0.5 * (self.start - sde.origin + reference)
+                steps = jax.vmap(sde.linearised_step, (0, 0, None))(ts[:-1], ts[1:], halfway)
+                return HalfwayPlan(backward_filter(steps, seen))
+
+        class HalfwayPlan(AbstractPlan):
+            steps: tuple  # Λ, s and M at the grid times but the last
+
+            def steer(self, step, transition, dt, x, observed):
+                return GaussianSteering(transition, *step, observed)
+
+            def message(self, step, sde, t, x, observed):
+                operator, shift, covariance = step
+                factor = jnp.linalg.cholesky(covariance)
+                return GaussianMessage(operator, shift, factor, observed, jnp.zeros(()))
+    """
 
     @abc.abstractmethod
     def plan(self, sde: Displaced, seen: Observation, reference: State, ts) -> AbstractPlan:
@@ -85,19 +109,17 @@ class AbstractGuide(eqx.Module):
 
     @property
     def moves(self) -> bool:
-        """Whether it may be asked to plan for displacements from a moving origin, whose `sde` has
-        no `origin`.
+        """Whether it may plan for displacements from a moving origin, whose `sde` has no `origin`.
 
         So if it holds no states, and no process but the SDE's own.
         """
+        # A guide that says nothing gets a still origin: what it holds can be put into place.
         return False
 
     def prepared(
         self, sde: Displaced, seen: Observation, observed: State, reference: State, ts, start: State
     ) -> "AbstractGuide":
-        """The guide for paths from `start`, a displacement too, to what is observed, which `plan`
-        is not told.
-        """
+        """The guide for paths from `start`, a displacement too, of which `plan` is not told."""
         return self
 
     def follows(self, sde: Displaced, seen: Observation, reference: State) -> bool:
@@ -127,6 +149,7 @@ class AbstractGuide(eqx.Module):
 
 class _FrozenPlan(AbstractPlan):
     steps: tuple[Structured, State, Structured]
+    """Λ, s and M."""
     exact: bool = eqx.field(static=True)
 
     def steer(self, step, transition, dt, x, observed):
@@ -135,9 +158,9 @@ class _FrozenPlan(AbstractPlan):
 
     def message(self, step, sde, t, x, observed):
         operator, shift, covariance = step
-        return GaussianMessage(
-            operator, shift, semidefinite_cholesky(covariance), observed, jnp.zeros((), x.dtype)
-        )
+        # M may be singular: of an exact observation a part may be forecast without variance.
+        factor = semidefinite_cholesky(covariance)
+        return GaussianMessage(operator, shift, factor, observed, jnp.zeros((), x.dtype))
 
 
 class FrozenGuide(AbstractGuide):
@@ -175,7 +198,8 @@ class FrozenGuide(AbstractGuide):
             f"`rounds` linearise the SDE itself, and `auxiliary` is linear; got rounds={rounds}. "
             "Give one of the two.",
         )
-        self.auxiliary, self.way = auxiliary, None
+        self.auxiliary = auxiliary
+        self.way = None
 
     def check(self, sde, x):
         if self.auxiliary is not None:
@@ -188,6 +212,7 @@ class FrozenGuide(AbstractGuide):
 
     @property
     def moves(self):
+        # The way of a round is of states, which a moving origin would have to carry along.
         return self.auxiliary is None and self.rounds == 0
 
     def prepared(self, sde, seen, observed, reference, ts, start):
@@ -226,11 +251,13 @@ class Way(NamedTuple):
 
     def at(self, ts) -> State:
         """The states at other times, by linear interpolation."""
+        # `jnp.interp` is for numbers; and a grid may have steps of no length, as in trees.
         after = jnp.clip(jnp.searchsorted(self.ts, ts, side="right"), 1, len(self.ts) - 1)
         before = self.ts[after - 1]
         length = self.ts[after] - before
         part = jnp.clip((ts - before) / jnp.where(length > 0, length, 1.0), 0.0, 1.0)
-        first, second = self.states[after - 1], self.states[after]
+        first = self.states[after - 1]
+        second = self.states[after]
         return first + rows(part, first) * (second - first)
 
 
@@ -250,17 +277,19 @@ def smoothed(
     """
     if guide.rounds == 0:
         return guide
+    # The first way is the straight line, at the starts of steps.
     ts = jnp.asarray(ts)
     duration = ts[-1] - ts[0]
     part = ((ts[:-1] - ts[0]) / jnp.where(duration > 0, duration, 1.0)).astype(start.dtype)
     line = start[None] + rows(part, start[None]) * (reference - start)[None]
 
     def along(states):
-        return eqx.tree_at(
-            lambda g: g.way, guide, Way(ts[:-1], states), is_leaf=lambda leaf: leaf is None
-        )
+        way = Way(ts[:-1], states)
+        return eqx.tree_at(lambda g: g.way, guide, way, is_leaf=lambda leaf: leaf is None)
 
     def another_round(states):
+        # The plan is linearised along the old way; its own path, each step at the mean μ of the
+        # steering, is the new one.
         plan = along(states).plan(sde, seen, reference, ts)
 
         def step(y, inputs):
@@ -271,6 +300,7 @@ def smoothed(
 
         ends = jax.tree.map(lambda a: a[1:], plan.steps)
         first = varying_like(start, sde, seen, observed, ts)
+        # The step to the end has no entry in a plan, and no later step starts where it ends.
         last, path = jax.lax.scan(step, first, (ts[:-2], ts[1:-1], ends))
         path = jnp.concatenate([path, last[None]])
         return jnp.where(jnp.all(jnp.isfinite(path)), path, states)
@@ -283,11 +313,18 @@ def smoothed(
 
 
 class RecedingPlan(AbstractPlan):
-    """Flow, shift and accumulated time, of which the forecast is made with the covariance at the
-    current state.
+    """Flow, shift and accumulated time: a forecast, once the covariance at a state is known.
+
+    With Ψ_k the linearised flow from time k to the end, the forecast from x at that time is
+
+        v ~ N(L Ψ_k x + s_k, Σ + L S_k Lᵀ),    S_k = Σ_{j ≥ k} dt_j Ψ_{j+1} a Ψ_{j+1}ᵀ,
+
+    a at the current state. S_k is linear in a, `_accumulated(κ_k, a)` with κ_k the sum of
+    dt_j Ψ_{j+1} ⊗ Ψ_{j+1}: so what a plan holds does not depend on the path.
     """
 
     steps: tuple[Structured, State, Structured]
+    """Ψ, s and κ."""
     seen: Observation
     end: "_End | None"
     """What is bridged by the covariance of the end."""
@@ -297,40 +334,31 @@ class RecedingPlan(AbstractPlan):
     def forecast(
         self, step, here: tuple[Structured, Structured]
     ) -> tuple[Structured, State, Structured | LowRank]:
-        """Operator, shift and covariance of what is observed, where σ and a of the process are
-        these.
-        """
+        """Operator, shift and covariance of what is observed, for a process of these σ and a."""
         flow, shift, kappa = step
         sigma, a = here
-        L, w = self.seen.operator, jnp.zeros(()) if self.end is None else self.end.weight
+        L = self.seen.operator
+        operator = compose(L, flow)
+        w = jnp.zeros(()) if self.end is None else self.end.weight
         if self.few is not None:
-            return (
-                compose(L, flow),
-                shift,
-                LowRank(self.few, w * kappa, compose(L, sigma), (1 - w) * kappa),
-            )
+            # By the factors L σ of both covariances: no matrix of all values is formed.
+            low_rank = LowRank(self.few, w * kappa, compose(L, sigma), (1 - w) * kappa)
+            return operator, shift, low_rank
         if self.end is not None:
             a = (1 - w) * a + w * self.end.covariance
-        return (
-            compose(L, flow),
-            shift,
-            add(self.seen.covariance, congruence(L, _accumulated(kappa, a))),
-        )
+        covariance = add(self.seen.covariance, congruence(L, _accumulated(kappa, a)))
+        return operator, shift, covariance
 
     def steer(self, step, transition, dt, x, observed):
-        return steered(
-            transition,
-            dt,
-            *self.forecast(step, per_time(transition, dt)),
-            observed,
-            self.seen.exact,
-        )
+        # σ and a at x are those of the transition: the kernel matrix is computed once a step.
+        forecast = self.forecast(step, per_time(transition, dt))
+        return steered(transition, dt, *forecast, observed, self.seen.exact)
 
     def message(self, step, sde, t, x, observed):
         operator, shift, covariance = self.forecast(step, sde.noise(t, x))
-        factor = semidefinite_cholesky(
-            covariance.dense() if isinstance(covariance, LowRank) else covariance
-        )
+        if isinstance(covariance, LowRank):
+            covariance = covariance.dense()
+        factor = semidefinite_cholesky(covariance)
         return GaussianMessage(operator, shift, factor, observed, jnp.zeros((), x.dtype))
 
 
@@ -367,7 +395,8 @@ class RecedingGuide(AbstractGuide):
             f"`end_weight` must be a number from 0 to 1; got {end_weight}.",
         )
         self.end_weight = None if value is not None and value == 0 else weight
-        self.rounds, self.way = positive_integer(rounds, "rounds", least=0), None
+        self.rounds = positive_integer(rounds, "rounds", least=0)
+        self.way = None
 
     @property
     def moves(self):
@@ -379,6 +408,8 @@ class RecedingGuide(AbstractGuide):
     def follows(self, sde, seen, reference):
         if sde.has_constant_covariance(reference):
             return False
+        # What comes after the end is told as a time, by which the covariance at the state is
+        # multiplied: so of processes whose linearised flow is a number.
         flow = jax.eval_shape(
             lambda: sde.linearised_step(jnp.zeros(()), jnp.ones(()), reference).operator
         )
@@ -390,39 +421,48 @@ class RecedingGuide(AbstractGuide):
                 sde, seen, reference, ts, linearised_steps(sde, reference, ts, self.way)
             )
         steps = linearised_steps(sde, reference, ts, self.way)
-        operator, shift = steps.operator, steps.shift
-        n, ndim = reference.shape[0], operator.ndim - 1
+        operator = steps.operator
+        shift = steps.shift
+        n = reference.shape[0]
+        ndim = operator.ndim - 1  # the first axis is that of the steps
         if ndim == 2 and n > _MAX_DENSE:
+            # Ψ ⊗ Ψ of a full Ψ has n⁴ numbers. With the diagonal in its place the shift is
+            # changed so that the step still agrees where it was linearised.
             kept = jnp.diagonal(operator, axis1=1, axis2=2)
-            near = (
-                jnp.broadcast_to(reference, shift.shape)
-                if self.way is None
-                else self.way.at(ts[:-1])
-            )
-            shift = shift + jax.vmap(lambda full, d, y: full @ y - apply(d, y))(
-                operator, kept, near
-            )
-            operator, ndim = kept, 1
+            if self.way is None:
+                near = jnp.broadcast_to(reference, shift.shape)
+            else:
+                near = self.way.at(ts[:-1])
+            missing = jax.vmap(lambda full, d, y: full @ y - apply(d, y))(operator, kept, near)
+            shift = shift + missing
+            operator = kept
+            ndim = 1
 
         def back(carry, inputs):
+            """From the end of a step, whose Ψ is in the carry, to its start."""
             flow, total, kappa = carry
             phi, beta, dt = inputs
+            # noise and shift of a step come at its end, the flow acts from its start
             kappa = kappa + dt * _square(flow)
             total = total + apply(compose(seen.operator, flow), beta)
             flow = compose(flow, phi)
             return (flow, total, kappa), (flow, total, kappa)
 
         one = promote(jnp.ones((), reference.dtype), ndim, n)
+        # The carry of a scan keeps its shape, so `beyond`, a number, is given that of κ.
         beyond = beyond + jnp.zeros_like(_square(one))
         start = (one, jnp.zeros_like(apply(seen.operator, reference)), beyond)
         start = varying_like(start, seen, operator, shift, ts)
         _, planned = jax.lax.scan(back, start, (operator, shift, jnp.diff(ts)), reverse=True)
         sigma, a = sde.noise(ts[-1], reference)
-        w, errors = self.end_weight, None
+        w = self.end_weight
+        end = None if w is None else _End(w, a)
+        errors = None
+        # With a diagonal or full Ψ the sum over steps has a higher rank than σ.
         if is_low_rank(sigma, seen) and ndim == 0:
             assert seen.factor is not None
             errors = Errors.of(seen.factor, None if w is None else compose(seen.operator, sigma))
-        return RecedingPlan(planned, seen, None if w is None else _End(w, a), errors)
+        return RecedingPlan(planned, seen, end, errors)
 
 
 class DriftGuide(AbstractGuide):
@@ -464,6 +504,7 @@ class _DriftPlan(AbstractPlan):
     wrapped: AbstractPlan
 
     def steer(self, step, transition, dt, x, observed):
+        # The mean of the other's step, with the noise as it was: B = I.
         return DriftSteering(self.wrapped.steer(step, transition, dt, x, observed).mean())
 
     def message(self, step, sde, t, x, observed):
@@ -475,6 +516,7 @@ class _DriftPlan(AbstractPlan):
 
 def is_low_rank(sigma: Structured, seen: Observation) -> bool:
     """Whether fewer noises drive what is seen than it has values, whose errors are independent."""
+    # A scalar σ has as many noises as rows, and 0 values are never too many.
     num_values = len(seen.operator if seen.operator.ndim else sigma) if sigma.ndim else 0
     return seen.factor is not None and seen.factor.ndim < 2 and are_few(sigma, num_values)
 
@@ -494,12 +536,11 @@ def steered(
     observed: State,
     may_be_empty: bool = False,
 ) -> GaussianSteering | NoiseSteering:
-    """A step whose end is seen as N(operator x' + shift, covariance), in the space of what is
-    smaller.
-    """
+    """A step whose end is seen as N(operator x' + shift, covariance), in the smaller space."""
     if not isinstance(covariance, LowRank):
         return GaussianSteering(transition, operator, shift, covariance, observed, may_be_empty)
     r = observed - shift - apply(operator, transition.mean)
+    # The step moves what is seen by √dt L σ u, and `covariance` has L σ: s = √dt.
     return NoiseSteering(covariance, safe_sqrt(dt), r)
 
 
@@ -516,6 +557,9 @@ def backward_filter(steps: AffineStep, seen: Observation) -> tuple[Structured, S
         carry = (compose(operator, step.operator), shift, M)
         return carry, carry
 
+    # Λ and M begin as numbers or diagonals and may become matrices, but the carry of a scan keeps
+    # its shape. Two steps, of shapes alone, reach the ranks that they end with: in the first Λ
+    # takes that of Φ, in the second M that of Λ.
     shapes = jax.eval_shape(lambda: back((*start, seen.covariance), first)[0])
     shapes = jax.eval_shape(lambda s: back(s, first)[0], shapes)
     operator = promote(seen.operator, len(shapes[0].shape), n)
@@ -527,9 +571,9 @@ def _square(flow: Structured) -> Structured:
     """Ψ ⊗ Ψ, so that Ψ a Ψᵀ is `_accumulated(Ψ ⊗ Ψ, a)`."""
     if flow.ndim == 0:
         return flow * flow
-    return (
-        flow[:, None] * flow[None, :] if flow.ndim == 1 else jnp.einsum("ia,jb->iajb", flow, flow)
-    )
+    if flow.ndim == 1:
+        return flow[:, None] * flow[None, :]
+    return jnp.einsum("ia,jb->iajb", flow, flow)
 
 
 def _accumulated(kappa: Structured, a: Structured) -> Structured:
@@ -537,6 +581,7 @@ def _accumulated(kappa: Structured, a: Structured) -> Structured:
     if kappa.ndim == 0:
         return kappa * a
     if kappa.ndim == 2:
+        # Ψ is diagonal: (Ψ a Ψᵀ)_ij = Ψ_i a_ij Ψ_j.
         return kappa * a if a.ndim == 2 else jnp.diagonal(kappa) * a
     n = kappa.shape[0]
     return jnp.einsum("iajb,ab->ij", kappa, promote(a, 2, n))

@@ -1,5 +1,4 @@
-"""The guided step, a diffrax solver over the pair (state, log weight), and the driving noise on a
-grid.
+"""The guided step, a diffrax solver of the pair (state, log weight), and driving noise on a grid.
 
 Each state is drawn from the model's own transition conditioned on the guide's forecast; the log
 weight is the exact discrete ratio.
@@ -46,12 +45,16 @@ class GridNoise(diffrax.AbstractBrownianPath):
 
     def evaluate(self, t0, t1=None, left=True, use_levy=False):
         t1 = t0 if t1 is None else t1
-        dt, z = t1 - t0, self.noise[self.index(jnp.asarray(t0))]
+        dt = t1 - t0
+        z = self.noise[self.index(jnp.asarray(t0))]
         if not issubclass(self.levy_area, diffrax.SpaceTimeLevyArea):
+            # a branch of a tree may have no length, where √dt has no derivative
             return safe_sqrt(dt) * z
         z, area = jnp.split(z, 2)
         W = jnp.sqrt(dt) * z
-        return diffrax.SpaceTimeLevyArea(dt=dt, W=W, H=jnp.sqrt(dt / 12) * area) if use_levy else W
+        # H is independent of W and N(0, dt/12): the mean distance of the path from its chord.
+        H = jnp.sqrt(dt / 12) * area
+        return diffrax.SpaceTimeLevyArea(dt=dt, W=W, H=H) if use_levy else W
 
 
 class GuidedTerm(diffrax.AbstractTerm):
@@ -80,25 +83,29 @@ class GuidedTerm(diffrax.AbstractTerm):
 
         return cls(sde, plan, step, observed, control)
 
+    # diffrax forms increments as prod(vf(t, y), contr(t0, t1)). A guided step is not bilinear, so
+    # `vf` hands on the pair itself and `contr` all that else is needed; `prod` does the step.
+
     def vf(self, t, y, args):
         return y
 
     def contr(self, t0, t1, **kwargs):
         dt = t1 - t0
-        # a step may have no length
+        # Steering takes z, not an increment √dt z; a step may have no length.
         z = self.control.evaluate(t0, t1) / jnp.sqrt(jnp.where(dt == 0, 1.0, dt))
         return t0, t1, z, self.step(t0)
 
     def prod(self, vf, control):
-        (x, log_weight), (t0, t1, z, planned) = vf, control
+        x, log_weight = vf
+        t0, t1, z, planned = control
         transition = self.sde.transition(t0, t1, x)
-        u, step_weight = self.plan.steer(planned, transition, t1 - t0, x, self.observed).drive(z)
+        steering = self.plan.steer(planned, transition, t1 - t0, x, self.observed)
+        u, step_weight = steering.drive(z)
         return transition.mean + apply(transition.factor, u), log_weight + step_weight
 
 
 class GuidedStep(diffrax.AbstractItoSolver):
-    """One step of the model's transition, conditioned on the guide's forecast; adds the step's
-    exact log weight.
+    """The model's transition, conditioned on the guide's forecast; adds the exact log weight.
 
     Nothing blows up as the observation noise vanishes or dt · a · H grows.
     """
@@ -107,7 +114,7 @@ class GuidedStep(diffrax.AbstractItoSolver):
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms):
-        return None
+        return None  # of ODEs, which it does not solve
 
     def strong_order(self, terms):
         return 0.5

@@ -18,7 +18,32 @@ from ._parameters import point, positive_scalar, scalar, squared_distances
 
 
 class AbstractKernel(eqx.Module):
-    """A symmetric positive definite function on R^dim. `k1 + k2`, `c * k` (c > 0) are kernels."""
+    """A symmetric positive definite function on R^dim. `k1 + k2`, `c * k` (c > 0) are kernels.
+
+    A subclass gives values for points, and two closed forms or a `ValueError` where there is none.
+    A kernel of the distance alone is shorter as an `AbstractRadialKernel`, which asks for its
+    profile. Here lengths are measured in a metric, |x − y|²_G = (x − y)ᵀ G (x − y):
+
+        class StretchedKernel(AbstractKernel):
+            amplitude: Array
+            root: Array  # (dim, dim), with rootᵀ root = G
+
+            def matrix(self, x, y):
+                unit = nb.GaussianKernel(1.0, 1.0)
+                return self.amplitude * unit.matrix(x @ self.root.T, y @ self.root.T)
+
+            @property
+            def variance(self):
+                return self.amplitude
+
+            def convolved_with(self, other, dim):
+                raise ValueError("pass a `StretchedKernel` as `covariance=`.")
+
+            def spectral_density(self, omega, dim):
+                square = jnp.sum((omega @ jnp.linalg.inv(self.root)) ** 2, axis=-1)
+                volume = (2 * jnp.pi) ** (dim / 2) / jnp.abs(jnp.linalg.det(self.root))
+                return self.amplitude * volume * jnp.exp(-0.5 * square)
+    """
 
     __array_ufunc__ = None  # a NumPy number on the left leaves the product to `__rmul__`
 
@@ -33,9 +58,7 @@ class AbstractKernel(eqx.Module):
 
     @abstractmethod
     def convolved_with(self, other: "AbstractKernel", dim: int) -> "AbstractKernel":
-        """The kernel ∫ k(x, y) other(x', y) dy over R^dim; `ValueError` where no closed form is
-        known.
-        """
+        """The kernel ∫ k(x, y) other(x', y) dy over R^dim; `ValueError` without a closed form."""
 
     @abstractmethod
     def spectral_density(self, omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
@@ -53,6 +76,7 @@ class AbstractKernel(eqx.Module):
         """k(x, y) of two points."""
         return self.matrix(point(x, "x")[None], point(y, "y")[None])[0, 0]
 
+    # Sums are flat: a sum of sums has one list of terms, whose pairs are convolved.
     def __add__(self, other: "AbstractKernel") -> "AbstractKernel":
         if not isinstance(other, AbstractKernel):
             return NotImplemented
@@ -80,11 +104,11 @@ class AbstractRadialKernel(AbstractKernel):
     def scales(self, dtype: jnp.dtype | None = None) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Amplitude and length scale in one precision; `ValueError` if either has an axis."""
         dtype = self.amplitude.dtype if dtype is None else dtype
-        return scalar(self.amplitude, "amplitude", dtype), scalar(
-            self.length_scale, "length_scale", dtype
-        )
+        amplitude = scalar(self.amplitude, "amplitude", dtype)
+        return amplitude, scalar(self.length_scale, "length_scale", dtype)
 
     def matrix(self, x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:
+        # Of squares: √ has no slope where points coincide, and a smooth profile needs none.
         distances = squared_distances(x, y)
         amplitude, length_scale = self.scales(distances.dtype)
         return amplitude * self.profile(distances / jnp.square(length_scale))
@@ -116,6 +140,8 @@ class KernelCombination(AbstractKernel):
         return self._sum([k.variance for k in self.kernels])
 
     def convolved_with(self, other: AbstractKernel, dim: int) -> AbstractKernel:
+        # Bilinear; and where it is with itself, the terms are the same objects, as a
+        # `MaternKernel` asks for.
         pairs = [
             (c * d.astype(c.dtype), first.convolved_with(second, dim))
             for c, first in _terms(self)

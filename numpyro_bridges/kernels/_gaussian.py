@@ -46,9 +46,9 @@ class GaussianKernel(AbstractRadialKernel):
         alpha, ell = self.scales()
         beta, m = other.scales(alpha.dtype)
         width = jnp.hypot(ell, m)
-        return GaussianKernel(
-            alpha * beta * (2 * jnp.pi * jnp.square(ell * m / width)) ** (dim / 2), width
-        )
+        # (ℓ m / width)² = ℓ² m² / (ℓ² + m²)
+        volume = (2 * jnp.pi * jnp.square(ell * m / width)) ** (dim / 2)
+        return GaussianKernel(alpha * beta * volume, width)
 
     def spectral_density(self, omega: Float[Array, "... dim"], dim: int) -> Float[Array, "..."]:
         """q̂(ω) = amplitude (2π length_scale²)^{dim/2} exp(-length_scale² |ω|² / 2)."""

@@ -2,8 +2,8 @@
 
 In the scaling r = |x - y| / length_scale, without the factor √(2ν) of much of the literature,
 
-    M_p(r) = Σ_i c_i r^i e^{-r},   c_{p-i} = p! (p + i)! 2^{p-i} / ((2p)! i! (p - i)!),   ν = p +
-    1/2.
+    M_p(r) = Σ_i c_i r^i e^{-r},   c_{p-i} = p! (p + i)! 2^{p-i} / ((2p)! i! (p - i)!),
+    ν = p + 1/2.
 """
 
 from functools import partial
@@ -42,6 +42,7 @@ def _matern(p: int, s: Float[Array, "..."]) -> Float[Array, "..."]:
     0 stands for it: the mean of the two sides.
     """
     r = jnp.sqrt(s)
+    # Horner's scheme
     polynomial = jnp.zeros_like(r)
     for c in _coefficients(p):
         polynomial = polynomial * r + c
@@ -50,10 +51,12 @@ def _matern(p: int, s: Float[Array, "..."]) -> Float[Array, "..."]:
 
 @_matern.defjvp
 def _(p, primals, tangents):
-    (s,), (ds,) = primals, tangents
+    (s,) = primals
+    (ds,) = tangents
     if p > 0:
         slope = _matern(p - 1, s) / (-2.0 * (2 * p - 1))
     else:
+        # the inner `select` keeps an infinite slope out of derivatives of this one
         r = jnp.sqrt(lax.select(s > 0, s, jnp.ones_like(s)))
         slope = lax.select(s > 0, -0.5 * jnp.exp(-r) / r, jnp.zeros_like(s))
     return _matern(p, s), slope * ds
@@ -72,10 +75,10 @@ def _order(value: Any) -> int:
 class MaternKernel(AbstractRadialKernel):
     """k(x, y) = amplitude · M_order(r), r = |x - y| / length_scale, of smoothness ν = order + 1/2.
 
-    Orders 0, 1 and 4 are e^{-r}, (1 + r) e^{-r} and (1 + r + 45/105 r² + 10/105 r³ + 1/105 r⁴)
-    e^{-r}. The convolution with itself has smoothness 2ν + dim/2: in odd dimensions another kernel
-    of this class, in even ones a Bessel function of integer order, which has no closed form here
-    (`ValueError`).
+    Orders 0, 1 and 4 are e^{-r}, (1 + r) e^{-r} and
+    (1 + r + 45/105 r² + 10/105 r³ + 1/105 r⁴) e^{-r}. The convolution with itself has smoothness
+    2ν + dim/2: in odd dimensions another kernel of this class, in even ones a Bessel function of
+    integer order, which has no closed form here (`ValueError`).
 
     **Arguments:** `amplitude` and `length_scale` are positive scalars; `order` is an integer from 0
     on.
@@ -97,18 +100,19 @@ class MaternKernel(AbstractRadialKernel):
     def convolved_with(self, other: AbstractKernel, dim: int) -> "MaternKernel":
         """With itself, in odd dimensions: order 2 · order + (dim + 1)/2, the same length scale."""
         dim = positive_integer(dim, "dim")
+        # The same object: traced length scales cannot be compared, and of two different ones there
+        # is no closed form.
         if other is not self or dim % 2 == 0:
-            what = (
-                f"in dimension {dim}"
-                if other is self
-                else f"with an `other`, {type(other).__name__}"
-            )
+            other_name = f"with an `other`, {type(other).__name__}"
+            what = f"in dimension {dim}" if other is self else other_name
             raise ValueError(
                 "a `MaternKernel` has a closed convolution with itself in odd dimensions only; "
                 f"got one {what}. Give the covariance itself (`covariance=`), or a "
                 "`QuadratureCovariance`."
             )
         amplitude, length_scale = self.scales()
+        # Of spectral densities the product: (1 + ℓ²|ω|²)^{−2(ν + dim/2)} is that of order ν' with
+        # ν' + dim/2 = 2ν + dim. Masses are q̂(0) at unit scales.
         order = 2 * self.order + (dim + 1) // 2
         mass = exp(2 * _log_mass(self.order, dim) - _log_mass(order, dim))
         return MaternKernel(amplitude**2 * mass * length_scale**dim, length_scale, order)

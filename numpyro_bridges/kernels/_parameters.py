@@ -1,6 +1,4 @@
-"""Parameters and points of kernels: what is checked when they come in, and again when they are
-used.
-"""
+"""Parameters and points of kernels: what is checked when they come in, and when they are used."""
 
 from collections.abc import Callable
 from functools import reduce
@@ -29,6 +27,7 @@ def scalar(value: Array, name: str, dtype: jnp.dtype) -> Float[Array, ""]:
 def positive_scalar(name: str) -> Callable[[ArrayLike], Float[Array, ""]]:
     """A field converter: a positive, finite scalar of the default float type, or traced."""
 
+    # A closure, since equinox calls a converter with the value alone and an error says the name.
     def convert(value: ArrayLike) -> Float[Array, ""]:
         value = as_float(value, name)
         value = scalar(value, name, value.dtype)
@@ -63,15 +62,15 @@ def points(x: ArrayLike, name: str) -> Float[Array, "n dim"]:
 
 
 def squared_distances(x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:
-    """|x_i - y_j|² from differences: exactly 0 at coincident points, symmetric where x is y,
-    smooth.
-    """
-    x, y = points(x, "x"), points(y, "y")
+    """|x_i - y_j|² from differences: exactly 0 at coincident points, symmetric where x is y."""
+    x = points(x, "x")
+    y = points(y, "y")
     require(
         x.shape[1] == y.shape[1],
         f"`x` and `y` must hold points of one dimension; got shapes {x.shape} and {y.shape}.",
     )
-    # one coordinate at a time: whole n × m arrays, and a derivative with none of shape (n, m, dim)
+    # Not |x|² + |y|² − 2 x·y, whose cancellation may give near points a negative square.
+    # One coordinate at a time: whole n × m arrays, and a derivative with none of shape (n, m, dim).
     return reduce(
         jnp.add, (jnp.square(a[:, None] - b[None, :]) for a, b in zip(x.T, y.T, strict=True))
     )

@@ -55,7 +55,8 @@ class QuadratureCovariance(AbstractKernel):
             "a kernel, such as `MaternKernel(amplitude, length_scale)`",
         )
         self.kernel = kernel
-        self.lower, self.upper = as_float(lower, "lower"), as_float(upper, "upper")
+        self.lower = as_float(lower, "lower")
+        self.upper = as_float(upper, "upper")
         shape = self.lower.shape
         require(
             len(shape) == 1 and shape[0] > 0 and self.upper.shape == shape,
@@ -64,9 +65,11 @@ class QuadratureCovariance(AbstractKernel):
         )
         require_finite(self.lower, "lower")
         require_finite(self.upper, "upper")
-        low, high = concrete(self.lower), concrete(self.upper)
+        low = concrete(self.lower)
+        high = concrete(self.upper)
         if low is not None and high is not None and not np.all(low < high):
             raise ValueError(f"`lower` must lie below `upper` on every axis; got {low} and {high}.")
+        # A sequence or an array is one number for each axis; `positive_integer` judges the rest.
         cells: Any = num_cells
         several = isinstance(cells, Sequence) or getattr(cells, "ndim", 0) > 0
         per_axis = list(cells) if several else [cells] * shape[0]
@@ -85,6 +88,7 @@ class QuadratureCovariance(AbstractKernel):
     @property
     def centres(self) -> Float[Array, "cells dim"]:
         """Midpoints of the cells."""
+        # Asked again: `jax.vmap` of the constructor gives corners an axis more.
         require(
             self.lower.ndim == 1,
             f"`lower` must be of shape (dim,); got {self.lower.shape}. For a batch, use "
@@ -96,17 +100,21 @@ class QuadratureCovariance(AbstractKernel):
         return self.lower[None] + (self.upper - self.lower)[None] * unit
 
     def matrix(self, x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:
-        left, right = self._factor(x), self._factor(y)
+        # Positive semi-definite to the last digit where x is y: a product with its transpose.
+        left = self._factor(x)
+        right = self._factor(y)
         return jnp.matmul(left, right.T, precision="highest")
 
     def _factor(self, x: Float[Array, "n dim"]) -> Float[Array, "n cells"]:
         """k(x_i, y) √Δy."""
+        # in the precision of the points, whatever that of the box
         values = self.kernel.matrix(x, self.centres.astype(jnp.asarray(x).dtype))
         return values * jnp.sqrt(self.cell_volume).astype(values.dtype)
 
     @property
     def variance(self) -> Float[Array, ""]:
         """a(x, x) in the middle of the box."""
+        # It falls towards the border; this is what the kernel without a box has everywhere.
         middle = (self.lower + self.upper) / 2
         return self(middle, middle)
 

@@ -1,5 +1,4 @@
-"""A stochastic differential equation on H, dX = b(t, X) dt + σ(t, X) dW (Itô), and its one-step
-Gaussian transition.
+"""A stochastic differential equation on H, dX = b(t, X) dt + σ(t, X) dW (Itô), and its steps.
 
 States are `(n, dim)` or `(n,)`; σ acts on the first axis, so a = σσᵀ is n × n and the same for
 every column.
@@ -69,8 +68,28 @@ class DiffusionTerm(diffrax.AbstractTerm):
 
 
 class AbstractSDE(eqx.Module):
-    """dX = b(t, X) dt + σ(t, X) dW. A subclass gives `drift` and `noise`; parameters are array
-    leaves.
+    """dX = b(t, X) dt + σ(t, X) dW.
+
+    A subclass gives `drift`, `noise`, `space` and `has_constant_covariance`. Parameters are array
+    leaves, so that they can be traced and have priors. Times and states are those of one path; σ is
+    a scalar, a diagonal `(n,)` or a matrix `(n, k)`.
+
+        class GeometricBrownianMotion(nb.AbstractSDE):
+            growth: Array
+            volatility: Array
+            space: ClassVar[None] = None
+
+            def drift(self, t, x):
+                return self.growth * x
+
+            def noise(self, t, x):
+                sigma = self.volatility * x  # a diagonal: one noise for each row of x, (n,)
+                return sigma, sigma**2
+
+            def has_constant_covariance(self, x):
+                return False
+
+    Its steps are those of Euler and Maruyama; one with another scheme overrides `transition`.
     """
 
     if TYPE_CHECKING:  # no argument of a constructor, and a subclass may make it a property
@@ -83,9 +102,7 @@ class AbstractSDE(eqx.Module):
     """Where states live; `None` is Euclidean space."""
 
     has_exact_transition: ClassVar[bool] = False
-    """Whether a step of any length has its exact law, so that one is enough where nothing happens
-    on the way.
-    """
+    """Whether a step of any length has its exact law, so that one is enough."""
 
     @abc.abstractmethod
     def drift(self, t: RealScalar, x: State) -> State:
@@ -100,17 +117,13 @@ class AbstractSDE(eqx.Module):
         """Whether a(t, x) is known not to depend on x; decides the default guide."""
 
     def is_autonomous(self, x: State) -> bool:
-        """Whether b and σ are known not to depend on t; such an SDE is shown the time that has
-        elapsed since t0.
-        """
+        """Whether b and σ are known not to depend on t; it is then shown the time since t0."""
         return not depends_on(lambda t, y: (self.drift(t, y), self.noise(t, y)), x, 0)
 
     def frame(
         self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar
     ) -> "Frame":
-        """Displacements from `end`. An SDE whose noise-free path is known may let the origin move
-        along it.
-        """
+        """Displacements from `end`; an SDE may let the origin move along its noise-free path."""
         return still_frame(self, x0, end, elapsed, clock)
 
     def diffusion(self, t: RealScalar, x: State) -> Structured:
@@ -125,6 +138,7 @@ class AbstractSDE(eqx.Module):
         """½ Σ pᵀ a(t, x) p over columns, without a where few noises make it."""
         sigma, a = self.noise(t, x)
         if sigma.ndim == 2 and sigma.shape[1] < x.shape[0]:
+            # |σᵀ p|²; that a is formed as well is left to the compiler, which drops it
             return 0.5 * jnp.sum(apply(sigma.T, p) ** 2)
         return 0.5 * jnp.sum(p * apply(a, p))
 
@@ -142,8 +156,7 @@ class AbstractSDE(eqx.Module):
         return divergence(lambda y: self.covariance_divergence(t, y), x)
 
     def closed(self, t: RealScalar, x: State) -> "AbstractSDE":
-        """The same SDE for states shaped like x, with what a user's functions read frozen as it is
-        now.
+        """The same SDE for states shaped like x, with what a user's functions read frozen.
 
         An SDE whose coefficients are computed from its own leaves is that already.
         """
@@ -158,12 +171,15 @@ class AbstractSDE(eqx.Module):
         """The model's step from t0 to t1; Euler–Maruyama unless the class has its exact law."""
         dt = t1 - t0
         factor, covariance = self.noise(t0, x)
+        # The covariance as the SDE has it: of smooth noise it is a kernel matrix, cheaper and more
+        # accurate than the square of its factor. A step may have no length, where √ has no slope.
         return Transition(x, dt * self.drift(t0, x), safe_sqrt(dt) * factor, dt * covariance)
 
     def transition_from(
         self, origin: State, t0: RealScalar, t1: RealScalar, y: State
     ) -> Transition:
         """The step of the displacement y = x − origin."""
+        # The increment is that of x, and is added to y, which is small near the end of a bridge.
         return replace(self.transition(t0, t1, origin + y), start=y)
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
@@ -176,6 +192,7 @@ class AbstractSDE(eqx.Module):
         if x.size > _MAX_LINEARISED:
             return jnp.zeros((), x.dtype), b
         jacobian = jax.jacfwd(self.drift, argnums=1)(t, x)
+        # of shape (n, dim, n, dim) where a state has columns
         B = jacobian if x.ndim == 1 else jnp.einsum("idjd->ij", jacobian) / x.shape[1]
         return B, b - apply(B, x)
 
@@ -190,16 +207,15 @@ class AbstractSDE(eqx.Module):
         self, auxiliary: "AbstractSDE", t0: RealScalar, t1: RealScalar, x: State
     ) -> AffineStep:
         """A linear auxiliary process, stepped by the scheme that steps this SDE."""
+        # By Euler's scheme, even where the auxiliary process has an exact one: a guide that equals
+        # the SDE then has the same transitions, and its weights do not depend on the noise.
         dt = t1 - t0
         B, beta = auxiliary.linearised_drift(t0, x)
-        return AffineStep(
-            add(jnp.ones((), x.dtype), dt * B), dt * beta, dt * auxiliary.covariance(t0, x)
-        )
+        operator = add(jnp.ones((), x.dtype), dt * B)
+        return AffineStep(operator, dt * beta, dt * auxiliary.covariance(t0, x))
 
     def ito_is_stratonovich(self, x: State) -> bool:
-        """Whether the Itô and the Stratonovich reading coincide, so that Stratonovich solvers are
-        right too.
-        """
+        """Whether the Itô and the Stratonovich reading coincide: then solvers of both are right."""
         return self.has_constant_covariance(x)
 
     def terms(self, control: diffrax.AbstractPath) -> diffrax.MultiTerm:
@@ -210,21 +226,15 @@ class AbstractSDE(eqx.Module):
         )
 
     def start(self, x: State) -> State:
-        """x, a start; NaN, which is seen in every weight, where `check_state` would refuse it but x
-        is traced.
-        """
+        """x, a start; NaN where `check_state` would refuse it but cannot, since x is traced."""
         return x
 
     def check_end(self, find: Callable[[], State]) -> None:
-        """Warns where the state that `find()` returns, to which paths are led, is beyond what the
-        SDE can represent.
-        """
+        """Warns where the state `find()`, to which paths are led, is beyond this SDE."""
         return None
 
     def check_state(self, x: State) -> None:
-        """`ValueError` where x cannot be a state of this SDE. Coefficients are traced, at no time
-        in particular.
-        """
+        """`ValueError` where x cannot be a state. The time is traced, none in particular."""
         require_space(self.space, x)
         factor, drift = at_any_time(lambda t, y: (self.diffusion(t, y), self.drift(t, y)), x)
         if drift.shape != x.shape:
@@ -251,8 +261,7 @@ class Frame(NamedTuple):
 
 
 class Displaced(AbstractSDE):
-    """The process Y = X − origin of an SDE, in the time that has elapsed: `clock` is added to it
-    before `sde` is asked.
+    """The process Y = X − origin of an SDE, in the time that has elapsed: plus `clock`, the SDE's.
 
     y keeps its digits where it is small beside x; x = origin + y is formed only to evaluate b and σ
     there.
@@ -263,7 +272,9 @@ class Displaced(AbstractSDE):
     clock: Float[Array, ""]
 
     def __init__(self, sde: AbstractSDE, origin: State, clock: RealScalar):
-        self.sde, self.origin, self.clock = sde, origin, jnp.asarray(clock)
+        self.sde = sde
+        self.origin = origin
+        self.clock = jnp.asarray(clock)
 
     @property
     def space(self) -> AbstractSpace | None:
@@ -301,6 +312,7 @@ class Displaced(AbstractSDE):
         return self.sde.transition_from(self.origin, self.clock + t0, self.clock + t1, x)
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
+        # β anew, and not β + B o: the tangent at y passes through b there.
         B, _ = self.sde.linearised_drift(self.clock + t, self.origin + x)
         return B, self.drift(t, x) - apply(B, x)
 
@@ -329,8 +341,10 @@ def depends_on(f: Callable, x: State, argument: int) -> bool:
 
     The argument is followed from equation to equation: a `True` may be over-cautious.
     """
+    # JAX keeps what it has traced by the function, so a new one is made at each call.
     time = jax.ShapeDtypeStruct((), x.dtype)
     jaxpr = jax.make_jaxpr(lambda t, y: f(t, y))(time, x).jaxpr
+    # Equations come in order: one pass reaches all that depends on the argument.
     reached = {jaxpr.invars[argument]}
     for eqn in jaxpr.eqns:
         if any(not isinstance(v, Literal) and v in reached for v in eqn.invars):
@@ -339,9 +353,7 @@ def depends_on(f: Callable, x: State, argument: int) -> bool:
 
 
 def at_any_time(coefficient: Callable, x: State):
-    """Shapes of a coefficient (t, x), which may be defined on [t0, t1] only: the time is traced,
-    and no number.
-    """
+    """Shapes of a coefficient (t, x), which may be defined on [t0, t1] only: the time is traced."""
     time = jax.ShapeDtypeStruct((), x.dtype)
     # a new function at each call: JAX keeps shapes by the function
     return jax.eval_shape(lambda t, y: coefficient(t, y), time, x)

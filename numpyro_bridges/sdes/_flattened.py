@@ -21,7 +21,8 @@ class Flattened(AbstractSDE):
     dim: int = eqx.field(static=True)
 
     def __init__(self, sde: AbstractSDE, dim: int):
-        self.sde, self.dim = sde, dim
+        self.sde = sde
+        self.dim = dim
 
     @property
     def space(self) -> None:
@@ -67,6 +68,9 @@ class Flattened(AbstractSDE):
         covariance = for_every_column(step.covariance, self.dim)
         return Transition(x, step.increment.reshape(-1), factor, covariance)
 
+    # The linear parts are those of `sde`, not of a Jacobian in y, so that they stay products with
+    # the identity, and steps stay its own scheme's.
+
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
         B, beta = self.sde.linearised_drift(t, self.rows(x))
         return for_every_column(B, self.dim), beta.reshape(-1)
@@ -91,5 +95,6 @@ def for_every_column(A: Structured, dim: int) -> Structured:
         return A
     if A.ndim == 1:
         return jnp.repeat(A, dim)
+    # `jnp.kron`, as one product that JAX can fuse with what follows
     one = diagonal_matrix(jnp.ones((), A.dtype), dim)
     return jnp.einsum("ij,de->idje", A, one).reshape(A.shape[0] * dim, A.shape[1] * dim)

@@ -20,9 +20,7 @@ _PRECISION = 'or use double precision: `jax.config.update("jax_enable_x64", True
 
 
 class TimeGrid(eqx.Module):
-    """The times t0 + `elapsed` `(K + 1,)`, the first elapsed time being 0. As an array it is its
-    times.
-    """
+    """The times t0 + `elapsed` `(K + 1,)`, elapsed[0] being 0. As an array it is its times."""
 
     t0: Any
     """A NumPy number of double precision where it is known."""
@@ -36,7 +34,9 @@ class TimeGrid(eqx.Module):
     @property
     def ts(self) -> Array | np.ndarray:
         """The times, a NumPy array in double precision where the default would lose digits."""
-        begin, elapsed = concrete(self.t0), concrete(self.elapsed)
+        begin = concrete(self.t0)
+        elapsed = concrete(self.elapsed)
+        # An axis more behind a batch of starts, as of a grid that was made under `vmap`.
         if begin is None or elapsed is None:
             begin = jnp.asarray(self.t0, self.elapsed.dtype)
             return begin[..., None] + self.elapsed
@@ -46,18 +46,22 @@ class TimeGrid(eqx.Module):
 
     def since(self, t: RealScalar) -> Float[Array, ""]:
         """The time elapsed at t, without losing digits where both are known."""
-        dtype, begin, time = self.elapsed.dtype, concrete(self.t0), exact_float(t, "t")
+        dtype = self.elapsed.dtype
+        begin = concrete(self.t0)
+        time = exact_float(t, "t")
         if begin is not None and isinstance(time, np.ndarray):
-            return jnp.asarray(time - begin, dtype)
+            return jnp.asarray(time - begin, dtype)  # subtracted in double precision, then rounded
         return jnp.asarray(time, dtype) - jnp.asarray(self.t0, dtype)
 
     def clock(self, sde: AbstractSDE, x: State) -> Float[Array, ""]:
-        """What is added to the elapsed time that an SDE is shown: t0, or 0 where the time makes no
-        difference to it.
+        """What is added to the elapsed time that an SDE is shown: t0, or 0 if it does not ask.
 
         `ValueError` if its steps then vanish in the precision used.
         """
-        dtype, begin, elapsed = self.elapsed.dtype, concrete(self.t0), concrete(self.elapsed)
+        dtype = self.elapsed.dtype
+        begin = concrete(self.t0)
+        elapsed = concrete(self.elapsed)
+        # Most SDEs do not depend on the time: they keep the digits of their steps at any t0.
         if begin is not None and np.all(begin == 0) or sde.is_autonomous(x):
             return jnp.zeros((), dtype)
         if begin is not None and elapsed is not None:
@@ -83,9 +87,7 @@ def time_grid(
     *,
     graded: bool = False,
 ) -> TimeGrid:
-    """The user's grid, checked, or the default one: uniform, or graded towards t1 as t = s(2 −
-    s/T).
-    """
+    """The user's grid, checked, or the default: uniform, or graded towards t1, t = s(2 − s/T)."""
     if ts is not None:
         require(
             num_steps is None, f"Give `num_steps` or `ts`, not both; got num_steps = {num_steps}."
@@ -96,7 +98,8 @@ def time_grid(
             f"Give `t1` and `num_steps`, or a grid `ts`; got t1 = {t1}, num_steps = {num_steps}."
         )
     num_steps = positive_integer(num_steps, "num_steps")
-    begin, end = exact_float(0.0 if t0 is None else t0, "t0"), exact_float(t1, "t1")
+    begin = exact_float(0.0 if t0 is None else t0, "t0")
+    end = exact_float(t1, "t1")
     require(
         begin.ndim == 0 and end.ndim == 0,
         f"`t0` and `t1` must be one time each; got shapes {begin.shape} and {end.shape}. Use vmap "
@@ -106,10 +109,13 @@ def time_grid(
         jnp.isfinite(begin) & jnp.isfinite(end) & (end > begin),
         f"`t1` must be finite and later than `t0`; got t0 = {begin}, t1 = {end}.",
     )
+    # Of unit duration. Graded, steps shrink like the root of the time left: they are short where
+    # the pull to an exact end, which grows like one over it, is strong.
     s = np.linspace(0.0, 1.0, num_steps + 1)
     s = s * (2 - s) if graded else s
     if isinstance(begin, np.ndarray) and isinstance(end, np.ndarray):
         return _grid(begin, (end - begin) * s, "`num_steps`")
+    # Of a duration that is traced the shape of the grid is known still.
     _require_steps(s, "`num_steps`")
     duration = jnp.asarray(end, float) - jnp.asarray(begin, float)
     return TimeGrid(begin, duration * jnp.asarray(s, float))
@@ -136,9 +142,12 @@ def given_grid(ts, t0: RealScalar | None = None, t1: RealScalar | None = None) -
         if given is None:
             continue
         given = exact_float(given, name)
-        close = known and isinstance(given, np.ndarray)
+        comparable = known and isinstance(given, np.ndarray)
+        # To single precision, in which a grid may have been made.
         require(
-            not close or given.ndim == 0 and np.abs(ts[place] - given) <= 1e-5 * (ts[-1] - ts[0]),
+            not comparable
+            or given.ndim == 0
+            and np.abs(ts[place] - given) <= 1e-5 * (ts[-1] - ts[0]),
             f"`ts` must {verb} at `{name}`; got ts[{place}] = {ts[place]} and {name} = {given}. "
             "Give only `ts`.",
         )

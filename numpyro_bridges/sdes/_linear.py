@@ -1,7 +1,7 @@
 """Linear SDEs, stepped by their exact law.
 
-dX = (B X + β) dt + σ dW:   X_{t+τ} | X_t ~ N(e^{Bτ} X_t + ∫₀^τ e^{Bu} β du,  ∫₀^τ e^{Bu} σσᵀ
-e^{Bᵀu} du)
+dX = (B X + β) dt + σ dW:
+X_{t+τ} | X_t ~ N(e^{Bτ} X_t + ∫₀^τ e^{Bu} β du,  ∫₀^τ e^{Bu} σσᵀ e^{Bᵀu} du)
 """
 
 from typing import ClassVar
@@ -50,7 +50,8 @@ class BrownianMotion(AbstractSDE):
             "Give `covariance` or `factor`, one of the two.",
         )
         if factor is not None:
-            Q, F = None, as_float(factor, "factor")
+            Q = None
+            F = as_float(factor, "factor")
             require_finite(F, "factor")
             require(
                 F.ndim == 2 and F.size > 0,
@@ -59,7 +60,9 @@ class BrownianMotion(AbstractSDE):
         else:
             Q = _as_symmetric(covariance, "covariance")
             F = _factor_of_singular(Q, "covariance")
-        self.covariance_operator, self.factor = (Q, None) if F is None else (None, F)
+        # One of the two is held: leaves that say the same could be changed apart.
+        self.covariance_operator = Q if F is None else None
+        self.factor = F
         require_space(space)
         self.space = space
 
@@ -70,6 +73,7 @@ class BrownianMotion(AbstractSDE):
         if self.factor is not None:
             return self.factor, compose(self.factor, transpose(self.factor))
         assert self.covariance_operator is not None
+        # A traced Q may be any matrix: a slope is taken along symmetric ones.
         Q = symmetric(self.covariance_operator)
         return semidefinite_cholesky(Q), Q
 
@@ -127,6 +131,7 @@ class LinearSDE(AbstractSDE):
                 f"`{name}` must be a scalar, a vector or a matrix; got shape {value.shape}.",
             )
             require(value.size > 0, f"`{name}` must not be empty; got shape {value.shape}.")
+        # Sizes are compared with those of a state, by `check_state`: a diagonal does not say n.
         B = self.drift_operator
         require(
             B.ndim < 2 or B.shape[0] == B.shape[1], f"`drift` must be square; got shape {B.shape}."
@@ -184,13 +189,14 @@ class LinearSDE(AbstractSDE):
     def transition_from(
         self, origin: State, t0: RealScalar, t1: RealScalar, y: State
     ) -> Transition:
+        # With y = x − o: dY = (B Y + (B o + β)) dt + σ dW, linear too, so that no step of x, whose
+        # digits may be lost, is formed.
         return self._displaced(self.drift(t0, origin)).transition(t0, t1, y)
 
     def frame(
         self, x0: State, end: State, elapsed: Float[Array, " K+1"], clock: RealScalar
     ) -> Frame:
-        """Displacements from the noise-free path, moved so that it ends at `end`: they are as small
-        as the noise.
+        """Displacements from the noise-free path, moved to end at `end`: as small as the noise is.
 
         From `end` itself where that is nearer to the start: the noise-free path of an unstable
         equation may be far from where it is conditioned to go.
@@ -204,11 +210,17 @@ class LinearSDE(AbstractSDE):
             return apply(growth, x0) + shift
 
         way = end - x0
+        # A choice of coordinates, which changes no result and has no derivative.
         distance = jnp.max(jnp.abs(jax.lax.stop_gradient(way - moved(elapsed[-1]))))
         moves = distance <= jnp.max(jnp.abs(way))  # False of NaN too
+        # The still frame is the same formula at no time: the path stays at x0, and the gap is all
+        # of the way.
         times = jnp.where(moves, elapsed, 0.0)
         gap = way - moved(times[-1])
+        # o(t) = x(t) + gap, x(t) the noise-free path, so y = X − o has the drift B y + B gap; from
+        # a point `end` it has B y + b(end).
         drift = jnp.where(moves, apply(self.drift_operator, gap), self.drift(clock, end))
+        # The last origin is `end` itself, to the last digit.
         origins = jax.vmap(moved)(times[:-1]) + (x0 + gap)[None]
         return Frame(self._displaced(drift), jnp.concatenate([origins, end[None]]), -gap)
 
@@ -218,6 +230,7 @@ class LinearSDE(AbstractSDE):
     def auxiliary_step(
         self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State
     ) -> AffineStep:
+        # By its own exact law, as this SDE is stepped by its own.
         return auxiliary.linearised_step(t0, t1, x)
 
     def noise_size(self, x: State) -> int:
@@ -261,14 +274,14 @@ def _is_definite(Q: np.ndarray | None) -> bool:
 
 
 def _factor_of_singular(Q: Array, name: str) -> Array | None:
-    """F with F Fᵀ = Q for a matrix that is known to have fewer directions than rows; `None` for any
-    other.
-    """
+    """F with F Fᵀ = Q for a matrix known to have fewer directions than rows; `None` for others."""
     value = concrete(Q)
     if value is None or _is_definite(value):
         return None
     eigenvalues, vectors = np.linalg.eigh(value) if Q.ndim == 2 else (np.atleast_1d(value), None)
-    least, largest = eigenvalues.min(), eigenvalues.max()
+    least = eigenvalues.min()
+    largest = eigenvalues.max()
+    # Of a semi-definite matrix in this precision: eigenvalues as small are 0 but for rounding.
     rounding = 10 * len(eigenvalues) * np.finfo(value.dtype).eps * largest
     require(
         largest > 0 and least >= -rounding,
@@ -276,6 +289,6 @@ def _factor_of_singular(Q: Array, name: str) -> Array | None:
         f"to {largest:.3g}.",
     )
     if vectors is None:
-        return None
+        return None  # a diagonal with zeros has a root as it is
     kept = eigenvalues > rounding
     return jnp.asarray(vectors[:, kept] * np.sqrt(eigenvalues[kept]))

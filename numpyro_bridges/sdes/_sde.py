@@ -36,9 +36,7 @@ def wrapped(f: Callable) -> Any:
 
 @contextmanager
 def _no_escape(name: str):
-    """Says in words what JAX finds: a function that captured a value of a traced program which has
-    ended.
-    """
+    """Says in words what JAX finds: a captured value of a traced program that has ended."""
     try:
         yield
     except jax.errors.UnexpectedTracerError as e:
@@ -51,12 +49,11 @@ def _no_escape(name: str):
 
 
 class _Coefficient(eqx.Module):
-    """Calls a user's function, or the one of its own where that is a plain one; an array in the
-    state's precision.
-    """
+    """Calls a user's function, or its own where that is a plain one; in the state's precision."""
 
     name: str = eqx.field(static=True)
     own: _Static | None
+    """A function without leaves; one with leaves is an argument, so that they are traced."""
 
     def __call__(self, function: Callable | None, t: RealScalar, x: State, args: Any) -> Array:
         function = self.own if function is None else function
@@ -64,14 +61,13 @@ class _Coefficient(eqx.Module):
         with _no_escape(self.name):
             value = function(t, x, args)
         if isinstance(value, lx.AbstractLinearOperator):
+            # A diagonal one keeps its structure, by which all that follows is elementwise.
             value = lx.diagonal(value) if lx.is_diagonal(value) else value.as_matrix()
         return jnp.asarray(floating(value, f"{self.name}(t, x, args)"), x.dtype)
 
 
 class AbstractFunctionSDE(AbstractSDE):
-    """An SDE two of whose coefficients are a user's functions f(t, x, args): `diffusion`, and one
-    that pulls.
-    """
+    """An SDE of two functions f(t, x, args) of a user: `diffusion`, and one that pulls."""
 
     diffusion_function: Any
     args: Any
@@ -92,6 +88,7 @@ class AbstractFunctionSDE(AbstractSDE):
                 f"`{name}` must be a function f(t, x, args) of three arguments; got {f!r}. Add "
                 "those it does without.",
             )
+        # The field has the name of the user's argument, which a subclass chooses.
         setattr(self, f"{self.pull}_function", wrapped(pull))
         self.diffusion_function = wrapped(diffusion)
         self.args = jax.tree.map(lambda leaf: _parameter(leaf), args)
@@ -101,12 +98,16 @@ class AbstractFunctionSDE(AbstractSDE):
 
     def closed(self, t: RealScalar, x: State) -> Self:
         if self.programs is not None:
-            return self
+            return self  # as another bridge has closed it
+        # A copy whose fields are set: a module is frozen, and to construct it anew would check and
+        # wrap the functions again.
         closed = copy(self)
         programs = []
         for name in (self.pull, "diffusion"):
             field = f"{name}_function"
             function = getattr(self, field)
+            # A plain function is in the program, and is kept no longer: what `jit` compares is the
+            # program. A module is kept for its leaves, the parameters.
             own = function if isinstance(function, _Static) else None
             kept = None if own is function else function
             with _no_escape(name):
@@ -131,6 +132,7 @@ class AbstractFunctionSDE(AbstractSDE):
         return sigma, compose(sigma, transpose(sigma))
 
     def has_constant_covariance(self, x: State) -> bool:
+        # Of σ only: `noise` makes a from it.
         return not depends_on(lambda t, y: self.noise(t, y)[0], x, 1)
 
 
@@ -185,6 +187,6 @@ def _takes_three(f: Callable) -> bool:
         inspect.signature(f).bind(None, None, None)
     except TypeError:
         return False
-    except ValueError:  # it does not tell
+    except ValueError:  # it does not tell, as functions written in C
         pass
     return True

@@ -1,6 +1,4 @@
-"""Semilinear SDEs: a linear operator that generates a semigroup, and what is not linear held over a
-step.
-"""
+"""Semilinear SDEs: a generator of a semigroup, and what is not linear, held over a step."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -20,9 +18,7 @@ from ._exponential import affine_step, exponential_noise_size, exponential_trans
 from ._sde import AbstractFunctionSDE
 
 _MAX_LINEARISED = 64
-"""Largest state, n · dim numbers, of which the nonlinearity has its full Jacobian; beyond, its
-diagonal.
-"""
+"""Largest state, n · dim numbers, for a full Jacobian of the nonlinearity; beyond, its diagonal."""
 
 
 class SemilinearSDE(AbstractFunctionSDE):
@@ -33,8 +29,12 @@ class SemilinearSDE(AbstractFunctionSDE):
     modes of A decay, where a step of Euler–Maruyama must be short beside the fastest. For a
     reaction–diffusion equation A is ν Δ,
 
-        space = FourierBasis(32, 1) SemilinearSDE(0.1 * space.laplacian, lambda t, x, args:
-        space.from_points(f(space.to_points(x))), sigma)
+        space = FourierBasis(32, 1)
+
+        def reaction(t, x, args):
+            return space.from_points(f(space.to_points(x)))
+
+        SemilinearSDE(0.1 * space.laplacian, reaction, sigma)
 
     **Arguments:**
 
@@ -80,6 +80,7 @@ class SemilinearSDE(AbstractFunctionSDE):
         )
         require_finite(self.linear, "linear")
         if not callable(diffusion):
+            # A module, whose value is a leaf: it may be traced, and have a prior.
             diffusion = _Constant(as_float(diffusion, "diffusion"))
             require_finite(diffusion.value, "diffusion")
         super().__init__(nonlinearity, diffusion, args, space)
@@ -93,42 +94,46 @@ class SemilinearSDE(AbstractFunctionSDE):
 
     def transition(self, t0: RealScalar, t1: RealScalar, x: State) -> Transition:
         dt = t1 - t0
-        A, F = self._generator(x), self.pulled(t0, x)
+        A = self._generator(x)
+        F = self.pulled(t0, x)
         if self.scheme == "euler":
             return exponential_transition(A, F, self.noise(t0, x), dt, x)
+        # Midpoint: half a step without noise, and then the whole step with F and B from there.
         still = jnp.zeros((), x.dtype)
         growth, shift, _ = flow(A, F, still, 0.5 * dt)
         half = x + apply(growth, x) + shift
         t = t0 + 0.5 * dt
         step = exponential_transition(A, self.pulled(t, half), self.noise(t, half), dt, x)
+        # The noise at time u of a step is carried on by e^{(A + F') (dt − u)}. What A does is in
+        # the exact step; F', by its diagonal, enters as for the half step that is left on average.
         stretch = jnp.exp(0.5 * dt * self._mean_slope(t, half))
         factor = compose(stretch, step.factor)
         return Transition(x, step.increment, factor, congruence(stretch, step.covariance))
 
     def _mean_slope(self, t: RealScalar, x: State) -> Structured:
-        """The diagonal of F', or of large states its mean, nearly: vᵀ F' v / n for one v of random
-        signs.
-        """
+        """The diagonal of F'; of large states its mean, vᵀ F' v / n for one v of random signs."""
         if x.size <= _MAX_LINEARISED:
             return self._diagonal_slope(t, x)
+        # Always the same signs: a step is a function of the state, not of a draw.
         signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], x.shape), x.dtype)
         _, along = jax.jvp(lambda y: self.pulled(t, y), (x,), (signs,))
         return jnp.sum(signs * along) / x.size
 
     def linearised_drift(self, t: RealScalar, x: State) -> tuple[Structured, State]:
-        """A + F'(x) and β; of F' its diagonal for states of more than 64 numbers, so that a
-        diagonal A stays one.
-        """
+        """A + F'(x) and β; beyond 64 numbers F' is its diagonal, so that a diagonal A stays one."""
         slope, beta = self._linearised(t, x)
         return add(self._generator(x), slope), beta
 
     def linearised_step(self, t0: RealScalar, t1: RealScalar, x: State) -> AffineStep:
+        # Tangent to exponential Euler, also where the midpoint scheme steps: a guide need not be
+        # exact. `Displaced` puts the tangent through the step's own mean.
         slope, beta = self._linearised(t0, x)
         return affine_step(self._generator(x), slope, beta, self.covariance(t0, x), t1 - t0)
 
     def auxiliary_step(
         self, auxiliary: AbstractSDE, t0: RealScalar, t1: RealScalar, x: State
     ) -> AffineStep:
+        # B = A + (B − A): A by its semigroup, and the rest held, as F is.
         B, beta = auxiliary.linearised_drift(t0, x)
         A = self._generator(x)
         return affine_step(A, add(B, -A), beta, auxiliary.covariance(t0, x), t1 - t0)
@@ -153,9 +158,7 @@ class SemilinearSDE(AbstractFunctionSDE):
         super().check_state(x)
 
     def _linearised(self, t: RealScalar, x: State) -> tuple[Structured, State]:
-        """F' and β with F(t, y) ≈ F' y + β near x; F' acts on the first axis, its mean over
-        columns.
-        """
+        """F' and β with F(t, y) ≈ F' y + β near x; F' acts on rows, and is a mean over columns."""
         value = self.pulled(t, x)
         if x.size <= _MAX_LINEARISED:
             jacobian = jax.jacfwd(self.pulled, argnums=1)(t, x)
@@ -168,10 +171,10 @@ class SemilinearSDE(AbstractFunctionSDE):
         """The diagonal of F', one product with it at a time, so that no n × n matrix is held."""
         _, along = jax.linearize(lambda y: self.pulled(t, y), x)
 
-        def entry(direction):
-            return along(
-                jnp.zeros_like(x).reshape(-1).at[direction].set(1.0).reshape(x.shape)
-            ).reshape(-1)[direction]
+        def entry(i):
+            """eᵢᵀ F' eᵢ."""
+            direction = jnp.zeros_like(x).reshape(-1).at[i].set(1.0).reshape(x.shape)
+            return along(direction).reshape(-1)[i]
 
         entries = jax.lax.map(entry, jnp.arange(x.size), batch_size=_MAX_LINEARISED)
         return jnp.mean(entries.reshape(x.shape[0], -1), axis=1)

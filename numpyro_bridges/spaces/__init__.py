@@ -1,6 +1,4 @@
-"""Spaces of curves and of fields, discretised: a state is an array (size, dim), or (size,) for
-values in R.
-"""
+"""Spaces of curves and of fields: a state is an array (size, dim), or (size,) for values in R."""
 
 from ._base import AbstractSpace as AbstractSpace
 from ._basis import (

@@ -1,5 +1,4 @@
-"""What a space is: a finite set of functions on a domain, and the norm in which curves and fields
-are compared.
+"""What a space is: finitely many functions on a domain, and a norm that compares curves and fields.
 
 A function s ↦ x(s) in R^dim, such as a closed curve with s in [0, 2π), is held as a state of n rows
 x_i in R^dim,
@@ -19,10 +18,39 @@ from .._linalg import as_columns, rows, safe_sqrt
 
 
 class AbstractSpace(eqx.Module):
-    """Functions with values in R^dim, discretised. Everything is written for one state, (size,
-    dim).
+    """Functions with values in R^dim, discretised. All is written for one state, (size, dim).
 
-    A state of values in R may be a vector, (size,), and then so are its points.
+    A state of values in R may be a vector, (size,), and then so are its points. Here are functions
+    on [0, 1) that are constant on n equal cells:
+
+        class Cells(AbstractSpace):
+            num_cells: int = eqx.field(static=True)
+            dim: int = eqx.field(static=True)
+
+            @property
+            def size(self):
+                return self.num_cells
+
+            @property
+            def weights(self):
+                return jnp.full(self.num_cells, 1 / self.num_cells)
+
+            @property
+            def grid(self):
+                return self.parameters(self.num_cells)
+
+            def parameters(self, count):
+                return (np.arange(count) + 0.5) / count
+
+            def basis(self, s):
+                cell = (jnp.asarray(s) * self.num_cells).astype(int)
+                return jax.nn.one_hot(cell, self.num_cells)
+
+            def to_points(self, x):
+                return x  # one point in each cell
+
+            def from_points(self, values):
+                return values
     """
 
     dim: eqx.AbstractVar[int]
@@ -40,9 +68,7 @@ class AbstractSpace(eqx.Module):
 
     @abstractmethod
     def parameters(self, count: int) -> np.ndarray:
-        """So many parameters, evenly spread over the domain: those of points that are given
-        without.
-        """
+        """So many parameters, evenly spread over the domain: of points that are given without."""
 
     @abstractmethod
     def basis(self, s: ArrayLike) -> Float[Array, "m n"]:
@@ -58,7 +84,9 @@ class AbstractSpace(eqx.Module):
 
     def inner(self, x: Float[Array, "n *dim"], y: Float[Array, "n *dim"]) -> Float[Array, ""]:
         """⟨x, y⟩ = Σ_i w_i x_i · y_i."""
-        x, y = self._state(x), self._state(y, "y")
+        x = self._state(x)
+        y = self._state(y, "y")
+        # `jax.vmap` of a constructor gives weights an axis more, which would broadcast.
         require(
             jnp.ndim(self.weights) == 1,
             f"`weights` must be of shape ({self.size},); got {jnp.shape(self.weights)}. For a "
@@ -77,6 +105,7 @@ class AbstractSpace(eqx.Module):
     def evaluate(self, x: Float[Array, "n *dim"], s: ArrayLike) -> Float[Array, "m *dim"]:
         """The points x(s_j) of the curve."""
         x = self._state(x)
+        # A GPU would round the factors of a product to 10 bits.
         return jnp.matmul(self.basis(s).astype(x.dtype), x, precision="highest")
 
     def project(
@@ -87,8 +116,7 @@ class AbstractSpace(eqx.Module):
         **Arguments:**
 
         - `values`: points of a curve, (m, dim), at least as many as a state has rows. (The curve
-          through
-            fewer landmarks is `refine` from their own space.)
+          through fewer landmarks is `refine` from their own space.)
         - `s`: their parameters, (m,); `parameters(m)` if left out, for curves equispaced from 0 on.
 
         **Returns:** the state; where the points leave it open (repeated parameters), the one of
@@ -110,6 +138,7 @@ class AbstractSpace(eqx.Module):
             f"`s` must have one parameter for each of {values.shape[0]} points; got shape "
             f"{basis.shape[:1]}.",
         )
+        # By singular values: parameters may be repeated, where normal equations are singular.
         found = jnp.linalg.lstsq(basis.astype(values.dtype), as_columns(values))[0]
         return found.reshape(self.size, *values.shape[1:])
 
@@ -119,6 +148,7 @@ class AbstractSpace(eqx.Module):
         A coarser space gets what its `from_points` makes of the curve: its points, or projected
         coefficients.
         """
+        # Through the points of the finer space, where its coefficients are sums over a grid.
         require_instance(
             finer, AbstractSpace, "finer", "a space, such as `FourierBasis(num_modes, dim)`"
         )

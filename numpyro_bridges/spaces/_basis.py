@@ -21,8 +21,9 @@ def waves(s: ArrayLike, frequencies: np.ndarray, ndim: int = 1) -> tuple[Any, An
     large k.
     """
     converted = floating(s, "s")
-    traced = isinstance(converted, Tracer)
-    xp, s = (jnp, converted) if traced else (np, np.asarray(s, float))
+    xp: Any = jnp if isinstance(converted, Tracer) else np
+    # From what the user gave, not from `converted`, which may be rounded already.
+    s = converted if xp is jnp else np.asarray(s, float)
     what = "a vector of parameters" if ndim == 1 else "parameters (m, 2), a pair in each row"
     good = s.ndim == ndim and (ndim == 1 or s.shape[1] == 2)
     require(good, f"`s` must be {what}; got shape {s.shape}.")
@@ -35,6 +36,7 @@ def fourier_functions(s: ArrayLike, num_modes: int, ndim: int = 1) -> Any:
     """1, √2 cos s, √2 sin s, √2 cos 2s, ... at s, `(..., 2 num_modes + 1)`."""
     cosines, sines, s = waves(s, np.arange(1, num_modes + 1), ndim)
     xp = np if isinstance(s, np.ndarray) else jnp
+    # interleaved, cosine and sine of one frequency side by side, so that more modes are rows behind
     both: Any = xp.stack([cosines, sines], axis=-1).reshape(*cosines.shape[:-1], 2 * num_modes)
     one: Any = xp.ones_like(s)
     return xp.concatenate([one[..., None], sqrt(2) * both], axis=-1)
@@ -45,7 +47,28 @@ class AbstractBasis(AbstractSpace):
 
     The H-norm is the Euclidean norm of the coefficients. Fields are evaluated at q points of the
     domain, `grid`: with Φ the (q, n) values of the basis there, points are Φ x and the coefficients
-    of a field f are Φᵀ f / q, Φᵀ Φ / q = I.
+    of a field f are Φᵀ f / q, Φᵀ Φ / q = I. Here are even functions on a circle:
+
+        class EvenBasis(nb.AbstractBasis):
+            num_modes: int = eqx.field(static=True)
+            dim: int = eqx.field(static=True)
+            num_quadrature: int = eqx.field(static=True)  # more than 2 num_modes
+
+            @property
+            def size(self):
+                return self.num_modes + 1
+
+            @property
+            def laplacian(self):
+                return -(jnp.arange(self.size) ** 2.0)
+
+            def parameters(self, count):
+                return 2 * np.pi * np.arange(count) / count
+
+            def functions(self, s):
+                frequency = jnp.arange(self.size)
+                norm = jnp.where(frequency == 0, 1.0, jnp.sqrt(2))
+                return norm * jnp.cos(jnp.outer(s, frequency))
     """
 
     num_quadrature: eqx.AbstractVar[int]
@@ -53,9 +76,7 @@ class AbstractBasis(AbstractSpace):
     @property
     @abstractmethod
     def laplacian(self) -> Float[Array, " n"]:
-        """The eigenvalues of the Laplacian, none of them positive: ν Δ is the diagonal `ν *
-        space.laplacian`.
-        """
+        """The eigenvalues of the Laplacian, none positive: ν Δ is the diagonal `ν * laplacian`."""
 
     @abstractmethod
     def functions(self, s: ArrayLike) -> Any:
@@ -79,10 +100,10 @@ class AbstractBasis(AbstractSpace):
     def from_points(self, values: Float[Array, "q ..."]) -> Float[Array, "n ..."]:
         """Φᵀ f / q."""
         values = self._field(values)
+        # A product with a matrix and no FFT: m and q are small, and every basis does it alike.
         projection = self.functions(self.grid).T / len(self.grid)
-        return jnp.tensordot(
-            jnp.asarray(projection, values.dtype), values, axes=1, precision="highest"
-        )
+        projection = jnp.asarray(projection, values.dtype)
+        return jnp.tensordot(projection, values, axes=1, precision="highest")
 
     def _quadrature(self, num_quadrature: int | None, default: int, least: int, rule: str) -> int:
         """The number of points, checked."""
@@ -110,8 +131,7 @@ class FourierBasis(AbstractBasis):
     - `num_modes`: m, the highest frequency.
     - `dim`: dimension of the space in which the curve lies; 1 for a function.
     - `num_quadrature`: q, at least 2m + 1. With the default max(4m, 32) the coefficients of a field
-      that is
-        quadratic in the curve are exact.
+      that is quadratic in the curve are exact.
     """
 
     num_modes: int = eqx.field(static=True)
@@ -121,6 +141,8 @@ class FourierBasis(AbstractBasis):
     def __init__(self, num_modes: int, dim: int, *, num_quadrature: int | None = None):
         self.num_modes = positive_integer(num_modes, "num_modes")
         self.dim = positive_integer(dim, "dim")
+        # A square of the curve has frequencies up to 2m. On 4m points they are confused with those
+        # from 2m on, none of which is in the basis.
         default = max(4 * self.num_modes, 32)
         self.num_quadrature = self._quadrature(
             num_quadrature, default, self.size, "2 num_modes + 1"
@@ -142,10 +164,9 @@ class FourierBasis(AbstractBasis):
 
 
 class AbstractIntervalBasis(AbstractBasis):
-    """Waves on [0, length] from some lowest number of half waves up to num_modes, orthonormal in
-    L²(ds / length).
+    """Waves on [0, length] of up to num_modes half waves, orthonormal in L²(ds / length).
 
-    The q points are midpoints of q equal parts.
+    The least number of half waves is `lowest`. The q points are midpoints of q equal parts.
 
     **Arguments:**
 
@@ -153,8 +174,8 @@ class AbstractIntervalBasis(AbstractBasis):
     - `dim`: number of values at a point; 1 for a function.
     - `length`: of the interval.
     - `num_quadrature`: q, at least m + 1. With the default max(2m + 2, 32) the coefficients of a
-      field that is cubic in
-        the function are exact (a quadratic field of sines is no finite sum of sines).
+      field that is cubic in the function are exact (a quadratic field of sines is no finite sum of
+      sines).
     """
 
     num_modes: int = eqx.field(static=True)
@@ -187,6 +208,8 @@ class AbstractIntervalBasis(AbstractBasis):
         return np.pi / self.length * np.arange(self.lowest, self.num_modes + 1)
 
     def parameters(self, count: int) -> np.ndarray:
+        # Midpoints: sines and cosines of different numbers are orthogonal on these, to the last
+        # digit, as in the discrete transforms of type II.
         return self.length * (np.arange(count) + 0.5) / count
 
 
@@ -194,8 +217,7 @@ class SineBasis(AbstractIntervalBasis):
     """Functions on [0, length] that vanish at its ends (Dirichlet): coefficients of num_modes
     functions
 
-        √2 sin(π s / length), √2 sin(2π s / length), ..., √2 sin(mπ s / length)      (m =
-        num_modes).
+        √2 sin(π s / length), √2 sin(2π s / length), ..., √2 sin(mπ s / length)    (m = num_modes).
 
     **Arguments:** those of `AbstractIntervalBasis`.
     """
@@ -210,8 +232,7 @@ class CosineBasis(AbstractIntervalBasis):
     """Functions on [0, length] without slope at its ends (Neumann): coefficients of num_modes + 1
     functions
 
-        1, √2 cos(π s / length), √2 cos(2π s / length), ..., √2 cos(mπ s / length)      (m =
-        num_modes).
+        1, √2 cos(π s / length), ..., √2 cos(mπ s / length)      (m = num_modes).
 
     **Arguments:** those of `AbstractIntervalBasis`.
     """
@@ -219,6 +240,7 @@ class CosineBasis(AbstractIntervalBasis):
     lowest: ClassVar[int] = 0
 
     def functions(self, s: ArrayLike) -> Any:
+        # the constant has norm 1 without √2
         scale = np.where(np.arange(self.size) == 0, 1.0, sqrt(2))
         cosines: Any = waves(s, self._wave_numbers)[0]
         return cosines * scale.astype(cosines.dtype)[None]
@@ -260,6 +282,7 @@ class FourierSquare(AbstractBasis):
         return self.parameters(self.num_quadrature**2)
 
     def parameters(self, count: int) -> np.ndarray:
+        # Points in rows, as a field on a square grid is flattened.
         side = round(sqrt(count))
         require(
             side**2 == count,
@@ -270,6 +293,7 @@ class FourierSquare(AbstractBasis):
 
     def functions(self, s: ArrayLike) -> Any:
         values = fourier_functions(s, self.num_modes, ndim=2)
+        # (points, 2 directions, functions): all products of one function of each direction
         return (values[:, 0, :, None] * values[:, 1, None, :]).reshape(len(values), self.size)
 
 

@@ -23,8 +23,7 @@ class Landmarks(AbstractSpace):
     - `num_points`: n.
     - `dim`: dimension of the space in which the points lie.
     - `weights`: w, a positive scalar or one for each point. With the default 1/n the curve has unit
-      mass, and
-        its H-norm does not depend on n; with `1.0` variances are per landmark.
+      mass, and its H-norm does not depend on n; with `1.0` variances are per landmark.
     """
 
     num_points: int = eqx.field(static=True)
@@ -57,6 +56,7 @@ class Landmarks(AbstractSpace):
 
     def basis(self, s: ArrayLike) -> Float[Array, "m n"]:
         """Column i is the trigonometric interpolant of 1 at s_i and 0 at the other points."""
+        # The points' Fourier coefficients, evaluated at s; both are constants if s is known.
         num_modes = self.num_points // 2
         coefficients = fourier_functions(self.grid, num_modes).T / self.num_points
         # on the grid √2 cos(ns/2) has squared norm 2, and the sine vanishes
