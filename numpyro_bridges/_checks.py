@@ -59,9 +59,7 @@ _short.maxstring = _short.maxother = _short.maxlong = 80
 
 
 def concrete(x: Any) -> np.ndarray | None:
-    """The value as a NumPy array, or None while a program is traced, and where other processes hold
-    a part of it.
-    """
+    """The value as a NumPy array; None where it is traced, or other processes hold a part of it."""
     return np.asarray(x) if _is_here(x) else None
 
 
@@ -250,9 +248,7 @@ def known_number(
     rule: str = "a finite number",
     ok: Callable[[float], bool] = math.isfinite,
 ) -> float:
-    """A finite setting that is known before tracing and, in the precision in use, meets a rule, in
-    words too.
-    """
+    """A finite setting, known before tracing, that meets a rule in the precision in use."""
     number = known_float(value, name)
     with np.errstate(over="ignore", under="ignore"):
         rounded = number.astype(jnp.result_type(float))
@@ -284,9 +280,7 @@ def as_path(value: Any, name: str) -> Path:
 
 
 def require_key(key: Any, name: str = "key", several: bool = False) -> None:
-    """One random key, `jax.random.key(0)` or the raw `jax.random.PRNGKey(0)`, or `several` in one
-    array.
-    """
+    """One random key, typed or raw (`jax.random.PRNGKey(0)`), or `several` in one array."""
     message = f"`{name}` must be a random key, such as `jax.random.key(0)`; got {words(key)}."
     require(isinstance(key, (jax.Array, np.ndarray)), message)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)

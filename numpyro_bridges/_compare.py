@@ -1,6 +1,4 @@
-"""Several bridges on one estimand: the same evidence, by different guides, with what each of them
-costs.
-"""
+"""Several bridges on one estimand: one evidence by different guides, and what each costs."""
 
 import itertools
 import math

@@ -1,6 +1,4 @@
-"""Small sets of shapes for examples and tests, aligned and of unit size, and the tree of one of
-them.
-"""
+"""Small sets of shapes for examples and tests, aligned and of unit size, and a tree."""
 
 import csv
 import importlib.util
@@ -137,9 +135,7 @@ def _in_register(
 
 
 def _along_x(shapes: Shapes) -> Shapes:
-    """Turned so that the long axis of the mean is the x-axis and its first point lies at positive
-    x.
-    """
+    """Turned so that the mean's long axis is the x-axis and its first point lies at positive x."""
     _, _, axes = np.linalg.svd(shapes.mean)
     axes[0] *= np.sign(shapes.mean[0] @ axes[0])
     turn = np.stack([axes[0], [-axes[0, 1], axes[0, 0]]], axis=1)

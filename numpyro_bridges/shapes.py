@@ -370,8 +370,7 @@ def align_start(shapes: ArrayLike, reference: ArrayLike) -> NDArray:
 
 
 def _rotations(shapes: NDArray, target: NDArray) -> NDArray:
-    """Kabsch's R (..., d, d), det R = 1, that minimise ‖x R − target‖ for centred shapes x (..., n,
-    d)."""
+    """Kabsch's R (..., d, d), det R = 1, with least ‖x R − target‖, of centred x (..., n, d)."""
     u, _, vt = np.linalg.svd(np.swapaxes(shapes, -1, -2) @ target)
     u[..., -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return u @ vt

@@ -56,9 +56,7 @@ def one_of(parts, batched, own_shape, index):
 
 
 def find_batched(parts, batch_shape, declared, check) -> tuple[str, ...]:
-    """Names of the parts that carry the batch axes: as declared, or the one reading that `check`
-    accepts.
-    """
+    """Names of the parts with batch axes: as declared, or the one reading that `check` accepts."""
     carriers = [name for name, part in parts.items() if batch_shape and _carries(part, batch_shape)]
     if declared is not None:
         for name in declared:
@@ -113,9 +111,7 @@ def _carries(part, batch_shape) -> bool:
 
 
 def stacked(part, axes, inner, own):
-    """A part whose arrays have axes of a stack in front, and then the part's own batch axes: both,
-    then `inner`.
-    """
+    """A part whose arrays have the axes of a stack, then its own batch axes: widened to `inner`."""
 
     def widened(a):
         if not eqx.is_array(a):

@@ -112,9 +112,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
 
     @property
     def times(self):
-        """The times of a path, `(num_steps + 1,)`; with the batch axes in front where data have
-        their own.
-        """
+        """The times of a path, `(num_steps + 1,)`, behind a batch where data have their own."""
         ts = self.parts["ts"].ts
         if "ts" not in self._batched:
             return ts
@@ -209,9 +207,7 @@ def _bridge(parts, value) -> GuidedBridge:
 
 
 def close_parts(parts, one, names, num_axes, ts, several=()) -> None:
-    """Freezes what users' functions read, for one law and for the batch; `several`: parts of which
-    a law has many.
-    """
+    """Freezes what users' functions read; `several`: parts of which one law has many."""
 
     def set_closed(name, close):
         one[name] = close(one[name])

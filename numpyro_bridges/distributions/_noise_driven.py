@@ -1,6 +1,4 @@
-"""A NumPyro distribution of an observation whose density is that of a bridge, given standard normal
-noise.
-"""
+"""A NumPyro distribution of an observation: its density, given the noise, is a bridge's."""
 
 import copy
 import math
@@ -111,16 +109,12 @@ class AbstractNoiseDriven(dist.Distribution):
 
     @staticmethod
     def _check_data(parts, values):
-        """`ValueError` if one of the values, a leading axis of them, cannot be observed, by its
-        match alone.
-        """
+        """`ValueError` if one of the values (a leading axis) cannot be observed by the match."""
         raise NotImplementedError
 
     @property
     def has_rsample(self):
-        """`False`: what asks for it is a variational guide, and a law whose density needs the noise
-        cannot be one.
-        """
+        """`False`: variational guides ask, and a law whose density needs noise cannot be one."""
         return False
 
     @property
@@ -161,9 +155,7 @@ class AbstractNoiseDriven(dist.Distribution):
         )
 
     def sample(self, key, sample_shape=()):
-        """Observations of the unconditioned process. The bound noise, which belongs to a datum,
-        plays no part.
-        """
+        """Observations of the unconditioned process. Bound noise, of a datum, plays no part."""
         return self._over_batch(self._observe, *self._keys(key, sample_shape))
 
     def sample_with_noise(self, key, sample_shape=()):
@@ -184,9 +176,7 @@ class AbstractNoiseDriven(dist.Distribution):
         return self._log_prob_by(self._log_weight, (), value)
 
     def _log_prob_by_block(self, value):
-        """Terms of `log_prob`, an axis of `noise_blocks` behind those of the batch; their sum is
-        `log_prob`.
-        """
+        """Terms that add up to `log_prob`, an axis of `noise_blocks` behind those of the batch."""
         blocks = self.noise_blocks
         assert blocks is not None
         return self._log_prob_by(self._log_weights, (len(blocks.above),), value)
@@ -345,9 +335,7 @@ class AbstractNoiseDriven(dist.Distribution):
                 self._check_seen(data, np.broadcast_to(mask, full))
 
     def _check_seen(self, data, seen):
-        """All data at once; one after the other to name the one that is wrong, or where each has
-        its own match.
-        """
+        """All data at once; one by one to name a wrong one, or where each has its own match."""
         batched = tuple({"match"} & set(self._batched))
         match = {name: self.parts[name] for name in ("match", "settings") if name in self.parts}
         if not seen.any() or not batched and _passes(self._check_data, match, data[seen]):

@@ -1,6 +1,4 @@
-"""Sites with driving noise: a primitive, and a reparametrisation handler that does the same for
-`numpyro.sample`.
-"""
+"""Sites with driving noise: a primitive, and a handler that does the same for `numpyro.sample`."""
 
 import numpyro
 from numpyro import handlers

@@ -52,9 +52,7 @@ class _Settings(eqx.Module):
 
     @property
     def steps_together(self) -> int:
-        """Steps that every branch has, or every piece of it: a branch with more is a chain of
-        branches.
-        """
+        """Steps of every piece; a branch with more of them is a chain of pieces."""
         return int(np.gcd.reduce(self.num_steps))
 
     @property
@@ -412,9 +410,7 @@ def _unled(parts, value) -> TreeProblem:
 
 
 def _anchored(parts, sde: AbstractSDE, tree: Tree, conditions):
-    """Conditions with the observations that paths are led by: near where a Brownian motion would be
-    at each node.
-    """
+    """Conditions approximated near where a Brownian motion would be at each node, to lead paths."""
     x0, prior = parts["x0"], parts["root_covariance"]
     n = x0.shape[0]
     a = promote(sde.covariance(parts["t0"], x0), 2, n)
@@ -446,9 +442,7 @@ def _divided(parts) -> Tree:
 
 
 def _along(parts, by_piece):
-    """What is known at the states of all pieces, `(pieces, steps together + 1, ...)`, for each
-    branch as a whole.
-    """
+    """From `(pieces, steps together + 1, ...)`, at the states of pieces, to whole branches."""
     settings, active = parts["settings"], np.array(parts["tree"].active)
     together = settings.steps_together
     counts, pieces = np.array(settings.num_steps)[active - 1], settings.pieces[active - 1]

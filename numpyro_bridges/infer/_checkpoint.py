@@ -202,9 +202,7 @@ class _Chains:
         }
 
     def advance(self, state, begin, end):
-        """The state after iteration `end`, and what is kept since `begin`: arrays `(chains, draws,
-        ...)` by name.
-        """
+        """The state after iteration `end`, and arrays `(chains, draws, ...)` kept since `begin`."""
         state, draws = self._program(state, (begin, end))
         named, draws = gather((_named(_plain(state)), draws))
         kept = {}
@@ -250,9 +248,7 @@ class _Chains:
         return _plain(jax.tree.map(_array, fields | {self.mcmc._sample_field: samples}))
 
     def _advance(self, state, bounds):
-        """Iterations of one chain, or of a vectorised batch, between two numbers that are known
-        only when it runs.
-        """
+        """Iterations of a chain, or a vectorised batch, between bounds known only at run time."""
         begin, end = bounds
         empty = {
             k: jnp.zeros(x.shape, x.dtype)
@@ -281,9 +277,7 @@ class _Chains:
 
 
 def _over_chains(mcmc, mesh, fn, jit=lambda fn: fn):
-    """`fn(x, common)`, x being of one chain, for all chains: on the devices of a mesh, or by the
-    method of `mcmc`.
-    """
+    """`fn(x, common)`, x of one chain, for all: on a mesh, or by the chain method of `mcmc`."""
     method = mcmc.chain_method
     if mesh is None and (mcmc.num_chains == 1 or method == "vectorized"):
         return jit(fn)
@@ -358,9 +352,7 @@ def _settings_of(kernel, name) -> dict:
 
 
 def _described(x) -> str:
-    """A value that a file can hold: short ones in full, others by a hash; of what is no array, the
-    type.
-    """
+    """A value that a file can hold: a short one in full, others by a hash or their type."""
     if not hasattr(x, "dtype"):
         return (
             repr(x) if isinstance(x, bool | int | float | complex | str) else type(x).__qualname__

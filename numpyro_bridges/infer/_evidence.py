@@ -232,9 +232,7 @@ class _Particles(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """A temperature, the steps of a trajectory there, and the reference by which parameters are
-    whitened.
-    """
+    """A temperature, the steps of a trajectory there, and what whitens the parameters."""
 
     beta: Array
     num_steps: Array
@@ -295,9 +293,7 @@ class _Run:
         return self._spread(one)(keys)
 
     def _move(self, particles: _Particles, key, stage: _Stage, num_moves: int):
-        """Every particle moved on its own: where it is, its mean acceptance, and log p(v | θ, z)
-        after each move.
-        """
+        """Every particle moved: where it is, mean acceptance, log p(v | θ, z) after each move."""
 
         reference = stage.reference
 
@@ -365,9 +361,7 @@ def _check_sites(sites) -> None:
 
 
 def _resampled(particles: _Particles, key, change):
-    """Particles drawn in proportion to p(v | θ, z)^change, systematically, and the log of the mean
-    weight.
-    """
+    """Particles resampled systematically by p(v | θ, z)^change, and the log of the mean weight."""
     log_weights = change * particles.log_likelihood
     count = log_weights.size
     edges = jnp.cumsum(jax.nn.softmax(log_weights))
@@ -377,9 +371,7 @@ def _resampled(particles: _Particles, key, change):
 
 
 def _pilot(run: _Run, key, num_particles, num_moves, bar):
-    """Particles of the posterior, and what a run needs to know: a stage for each temperature, and
-    acceptances.
-    """
+    """Particles of the posterior, a stage for each temperature, and acceptances."""
     key, key_start = jr.split(key)
     particles = run.start(jr.split(key_start, num_particles))
     beta, step, stages, rates = 0.0, _LENGTH / 2, [], []

@@ -181,9 +181,7 @@ class AbstractPCN(AbstractBridgeKernel):
         )
 
     def _move(self, key, m, state, still, model_args, model_kwargs):
-        """Turns the noise of one block of time steps, or of one level of a tree, and decides for
-        each datum.
-        """
+        """Turns the noise of one block, or one level of a tree, and decides for each datum."""
         key_p, key_accept = jr.split(key)
         old, groups = state.z, groups_of(state.z, self._owners)
         number = state.i * self._num_moves + m
@@ -269,9 +267,7 @@ class PCN(AbstractPCN):
 
 
 class PCNL(AbstractPCN):
-    """Preconditioned Crank-Nicolson Langevin moves of the noise: `PCN` with gradients, which pay
-    where φ is small.
-    """
+    """Preconditioned Crank-Nicolson Langevin moves: `PCN` with gradients, for small φ."""
 
     def __init__(self, model, *, target_accept_prob: float = 0.7, **settings):
         super().__init__(model, target_accept_prob=target_accept_prob, **settings)
@@ -296,9 +292,7 @@ def _kicked(p, force, turns):
 
 
 class AbstractBlocks(ABC):
-    """Which noise a move turns, and what is decided; energies and angles are shaped as the
-    decisions.
-    """
+    """Which noise a move turns, and what is decided; energies and angles have its shape."""
 
     @abstractmethod
     def turns(self, number, angle, noise) -> Array:
@@ -326,9 +320,7 @@ class AbstractBlocks(ABC):
 
 
 class _TimeBlocks(AbstractBlocks):
-    """Blocks of time steps, an axis of the noise `(..., num_steps, k, dim)`. Each datum is decided
-    on its own.
-    """
+    """Blocks of time steps, axis −3 of the noise. Each datum is decided on its own."""
 
     def __init__(self, num_blocks: int):
         self._num_blocks = num_blocks
@@ -357,9 +349,7 @@ class _TimeBlocks(AbstractBlocks):
 
 
 class _TreeBlocks(AbstractBlocks):
-    """Branches of a tree, with an energy each, one after the other in the time steps. A move takes
-    one level.
-    """
+    """Branches of a tree, each with an energy and rows of noise. A move takes one level."""
 
     def __init__(self, blocks: NoiseBlocks, whole_clades: bool):
         above = blocks.above

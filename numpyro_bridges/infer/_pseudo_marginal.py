@@ -87,9 +87,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
 
     @abstractmethod
     def _evaluate(self, potential, theta: Array) -> tuple:
-        """The potential, `(value, energies)`, and minus its gradient, or none of it for a random
-        walk.
-        """
+        """The potential, `(value, energies)`, and minus its gradient, 0 for a random walk."""
 
     @abstractmethod
     def _best_step(self, d: int) -> float:
@@ -170,9 +168,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         return state._replace(potential_energy=value, force=force)
 
     def _potential(self, particles, unravel, model_args, model_kwargs):
-        """-log of the prior and of the estimate, as a function of θ, and the energies of the
-        particles.
-        """
+        """-log of prior and estimate as a function of θ, and the energies of the particles."""
 
         def potential(theta):
             sites = unravel(theta)
@@ -189,9 +185,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         return potential
 
     def _pick(self, key, particles, energies):
-        """For each datum, the noise of one particle, with probabilities proportional to the
-        weights.
-        """
+        """For each datum the noise of one particle, drawn in proportion to the weights."""
         groups = groups_of(particles, self._owners)
         picked = {}
         keys = jr.split(key, len(groups))
@@ -293,9 +287,7 @@ class CorrelatedPseudoMarginalMALA(AbstractPseudoMarginal):
 
 
 def _choose(log_weights, largest: int) -> int:
-    """The smallest number of particles by which the log estimate varies little enough, from pilot
-    weights.
-    """
+    """The fewest particles by which the log estimate varies little enough, from pilot weights."""
     rng = np.random.default_rng(0)
     pilot = [np.asarray(w, float) for w in log_weights]
     _warn_of_tails(np.concatenate(pilot, axis=1).T)

@@ -40,9 +40,7 @@ class Reference(NamedTuple):
 
 
 def laplace(potential, theta: Array) -> Reference:
-    """The mode of exp(-potential) and its inverse Hessian, both by BFGS from θ; N(θ, I) where that
-    fails.
-    """
+    """Mode and inverse Hessian of exp(-potential) by BFGS from θ; N(θ, I) where that fails."""
     start = Reference(theta, jnp.eye(theta.size, dtype=theta.dtype))
     if not theta.size:
         return start
@@ -57,9 +55,7 @@ _ROUNDING = 100.0
 
 
 class _Search(NamedTuple):
-    """The best point x so far, its value, slope and the inverse Hessian there; x + step is tried
-    next.
-    """
+    """The best x so far, with value, slope and inverse Hessian; x + step is tried next."""
 
     x: Array
     value: Array
@@ -145,17 +141,13 @@ def update_windows(
 
 
 def _schedule(num_warmup: int):
-    """Starts and ends of two windows. The start is near the mode: all but a tenth before and after
-    can be used.
-    """
+    """Starts and ends of two windows, without a tenth before them and after them."""
     cuts = [int(fraction * num_warmup) for fraction in (0.1, 0.3, 0.9)]
     return cuts[:2], cuts[1:]
 
 
 def from_moments(mean, m2, n) -> Reference:
-    """Correlations are shrunk as if 5 more draws had none: the factor exists for any number of
-    draws.
-    """
+    """Shrinks correlations as if 5 more draws had none, so that there always is a factor."""
     covariance = m2 / (n - 1)
     covariance = (n * covariance + 5 * jnp.diag(jnp.diag(covariance))) / (n + 5)
     return Reference(mean, jnp.linalg.cholesky(covariance))

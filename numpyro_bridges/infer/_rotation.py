@@ -1,6 +1,4 @@
-"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks by a force, trajectories, and the
-decision to accept.
-"""
+"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks, trajectories, acceptance."""
 
 import jax
 import jax.numpy as jnp

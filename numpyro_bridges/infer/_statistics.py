@@ -80,9 +80,7 @@ def _fields_of(kernel) -> tuple[str, ...]:
 
 
 def _blocks(kernel, path="", prefix="") -> list[tuple[Any, str, str]]:
-    """The kernels that make a draw, each with the path of its state and the prefix of its
-    statistics.
-    """
+    """The kernels that make a draw, with the path of its state and the prefix of its names."""
     if not isinstance(kernel, Gibbs):
         return [(kernel, path, prefix)]
     kernels = [block for block, _ in kernel.blocks]

@@ -24,9 +24,7 @@ def start_step_size(value: Array) -> StepSize:
 
 
 def update_step_size(step: StepSize, shortfall, bounds, *, renew, last) -> StepSize:
-    """After a draw with acceptance `shortfall` below target. `renew`: starts again at the mean;
-    `last`: stays there.
-    """
+    """After a draw `shortfall` below target. `renew`: anew from the mean; `last`: stays there."""
     averaging = _update(shortfall, step.averaging)
     log_value, log_mean = averaging[:2]
     mean = jnp.clip(jnp.exp(log_mean), *bounds)

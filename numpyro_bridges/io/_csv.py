@@ -421,8 +421,7 @@ def _bare_columns(table: Table) -> list[str]:
 
 
 def _decimal_sign(table: Table, columns: list[str], codes: Collection[str | float]) -> str:
-    """A comma where numbers have commas, none has a point, and the commas do not separate
-    thousands."""
+    """A comma where numbers have commas and no points, and these do not separate thousands."""
     every = [row.cells[name] for row in table.rows for name in columns]
     cells = [cell for cell in every if cell.lower() not in codes]
     with_comma = [cell for cell in cells if "," in cell]

@@ -148,8 +148,7 @@ def _column(header: Sequence[str], by: str | None) -> str | None:
 
 
 def _as_text(value: Any) -> str:
-    """A cell of pandas: whole numbers that it made floats are whole again, and what is missing is
-    nothing."""
+    """A cell of pandas: numbers that it made floats are whole again, the missing are empty."""
     if value is None or value != value:
         return ""
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)

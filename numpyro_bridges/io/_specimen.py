@@ -88,8 +88,7 @@ class Specimen:
 
 
 def open_text(path: str | PathLike, encoding: str) -> TextIO:
-    """A text file to write, compressed where its name ends in `.gz`; line ends are written as they
-    are."""
+    """A text file to write, compressed where its name ends in `.gz`; line ends stay as they are."""
     path = as_path(path, "path")
     check_encoding(encoding)
     if fspath(path).endswith(".gz"):
@@ -158,8 +157,7 @@ def read_lines(path: str | PathLike, encoding: str) -> list[str]:
 
 
 def stem(path: str | PathLike) -> str:
-    """The name of a file without its endings: what a specimen is called that has a file to
-    itself."""
+    """The name of a file without its endings, which a specimen has that is alone in it."""
     return re.sub(r"(?i)(\.mrk)?\.\w+(\.gz)?$", "", Path(path).name)
 
 
@@ -202,8 +200,7 @@ def number(
 
 
 def missing_codes(missing: str | float | Iterable[str | float]) -> frozenset[str | float]:
-    """Codes that a user names, and the usual texts: as texts, and those that are numbers as
-    numbers."""
+    """Codes that a user names, as texts and where possible as numbers, and the usual texts."""
     listed = isinstance(missing, Iterable) and not isinstance(missing, (str, bytes))
     codes: set[str | float] = set(NOT_AVAILABLE)
     for code in list(missing) if listed else [missing]:  # type: ignore[arg-type]

@@ -96,8 +96,7 @@ def write_tps(
 
 
 class _Lines:
-    """The lines with content: `current` is the next one, `None` at the end, and `number` its
-    number."""
+    """The lines with content: `current`, the next one (`None` at the end), and its `number`."""
 
     def __init__(self, path: str | PathLike, every: list[str]):
         self.path = path

@@ -1,6 +1,4 @@
-"""Log evidences of one estimand by several bridges, with their effective sample sizes and their
-cost.
-"""
+"""Log evidences of one estimand by several bridges, with effective sample sizes and cost."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -66,9 +64,7 @@ def _evidences(ax, values: NDArray, errors: NDArray, trusted: NDArray, colors: l
 def _bars(
     ax, values: NDArray, colors: list[str], label: str, totals: NDArray | None = None
 ) -> None:
-    """Horizontal bars with their numbers instead of an axis; what is not finite has a number and no
-    bar.
-    """
+    """Horizontal bars with numbers in place of an axis; what is not finite has no bar."""
     totals = values if totals is None else totals
     ax.barh(range(len(values)), _finite(values), height=0.5, color=colors)
     for i, (value, total) in enumerate(zip(values, totals, strict=True)):

@@ -111,9 +111,7 @@ def posterior(
 
 
 def _grid(values: NDArray, tail: float) -> NDArray:
-    """Where a density is drawn: between two quantiles and a little beyond, above zero if every draw
-    is.
-    """
+    """Where a density is drawn: a little beyond two quantiles, above zero if every draw is."""
     low, high = np.quantile(values, [tail, 1.0 - tail])
     margin = 3.0 * _bandwidth(values)
     low = low - margin
@@ -129,9 +127,7 @@ def _bandwidth(values: NDArray) -> float:
 
 
 def _density(values: NDArray, grid: NDArray) -> NDArray:
-    """Kernel estimate whose bandwidth is narrow where draws are dense (Abramson 1982): keeps sharp
-    modes.
-    """
+    """Kernel estimate, narrow where draws are dense (Abramson 1982), which keeps sharp modes."""
     values = values[:: max(1, len(values) // 4000)]
 
     def estimate(at: NDArray, bandwidth: NDArray) -> NDArray:

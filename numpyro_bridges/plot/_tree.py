@@ -181,9 +181,7 @@ def _axes(ax: Any, x: NDArray, y: NDArray, pitch: float, before: float) -> Any:
 
 
 def _around(ax: Any, x: float, y: float, inches: float, shift: float) -> Any:
-    """From the units of a shape to the canvas: around a point of the axes, `shift` inches to its
-    right.
-    """
+    """From units of a shape to the canvas: around a point, `shift` inches to its right."""
     from matplotlib.transforms import Affine2D, ScaledTranslation
 
     on_paper = Affine2D().scale(inches).translate(shift, 0.0) + ax.figure.dpi_scale_trans

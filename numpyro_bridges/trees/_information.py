@@ -36,9 +36,7 @@ class Information(NamedTuple):
         return cls.of(message, like)
 
     def as_observation(self) -> tuple[Observation, State, Float[Array, ""]]:
-        """The same as an observation w = Rᵀ y + N(0, I), R Rᵀ = H, and the log density that it has
-        too much.
-        """
+        """As an observation w = Rᵀ y + N(0, I), R Rᵀ = H, and the log density that this lacks."""
         R = cholesky(self.H + nugget(self.H))
         w = solve_lower(R, self.F)
         one = jnp.ones((), R.dtype)

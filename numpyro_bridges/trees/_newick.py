@@ -22,9 +22,7 @@ _TWO_LENGTHS = re.compile(r":[^,();:]*(:)")
 
 
 class Parsed(NamedTuple):
-    """Nodes in preorder; the parent of the root is −1, and the length of its edge `None` where none
-    is written.
-    """
+    """Nodes in preorder; the root's parent is −1, a length `None` where none is written."""
 
     parents: list[int]
     lengths: list[float | None]
@@ -32,9 +30,7 @@ class Parsed(NamedTuple):
 
 
 def text_of(source: str | PathLike) -> str:
-    """Text as it is, the content of a file by its path. Newick text has a parenthesis or a
-    semicolon.
-    """
+    """Text as it is (it has a parenthesis or a semicolon), the content of a file by its path."""
     if isinstance(source, str) and re.search(r"[(;]", source):
         return source
     return as_path(source, "source").read_text(encoding="utf-8-sig")
@@ -128,9 +124,7 @@ def _name(node: Any) -> str | None:
 
 
 def _is_support(label: str) -> bool:
-    """Inner nodes carry bootstrap and posterior supports, `95` or `0.98/100`, where a name would
-    be.
-    """
+    """Inner nodes may have supports, `95` or `0.98/100`, where a name would be."""
     try:
         return bool(np.all([np.isfinite(float(part)) for part in label.split("/")]))
     except ValueError:

@@ -18,9 +18,7 @@ _MAX_IDLE = 0.5
 
 
 class Schedule(NamedTuple):
-    """Static numbers. *Ends* are nodes on which nothing that is seen hangs any more, *inner* ones
-    the others.
-    """
+    """Static numbers. *Ends* are nodes below which nothing is seen, *inner* nodes the others."""
 
     ends: tuple[int, ...]
     """Nodes at the ends, in preorder."""
@@ -41,9 +39,7 @@ class Schedule(NamedTuple):
     """For each node of `inner` where its parent's state is kept; that of the root is in slot 0."""
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """`rounds` as an array, a place of no node holding the round's first once more, and which
-        of them are nodes.
-        """
+        """`rounds` as an array, padded with the first of each round, and which are nodes."""
         width = max(map(len, self.rounds), default=1)
         filled = [nodes + nodes[:1] * (width - len(nodes)) for nodes in self.rounds]
         taken = [[i < len(nodes) for i in range(width)] for nodes in self.rounds]
@@ -120,9 +116,7 @@ def _rounds_of(width: int, order: Sequence[int], parents: Sequence[int]) -> list
 
 
 def _slots(rounds, parents, children) -> tuple[dict[int, int], int]:
-    """For each node that has inner children a place until they have read it. A round reads before
-    it writes.
-    """
+    """For each node with inner children a place until these have read it."""
     slot_of, taken, free = {0: 0}, 1, []
     remaining = {node: len(own) for node, own in children.items()}
     for nodes in rounds:

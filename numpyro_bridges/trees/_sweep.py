@@ -122,9 +122,7 @@ class TreeProblem(eqx.Module):
         return cls(sde, guide, root, branches, conditions, tree.parents, observed, num_steps, walk)
 
     def anchored(self, t0) -> "TreeProblem":
-        """With anchors where a Brownian motion would be, given the data, for processes and guides
-        that need some.
-        """
+        """With anchors, where they are needed, at the mean of a Brownian motion given the data."""
         if self.sde.has_exact_transition or self.follows:
             return self
         walker, own = self._walker(None, t0), self.branches.own
@@ -167,9 +165,7 @@ class TreeProblem(eqx.Module):
 
     @property
     def follows(self) -> bool:
-        """Whether what is seen below a node is told by a mean, for the guide's covariances to
-        follow the state.
-        """
+        """Whether a node's data are told by a mean, for the guide's covariances to follow."""
         if self.branches.own is not None:
             return False
         branch = jax.tree.map(lambda a: a[0], self.branches)
@@ -202,9 +198,7 @@ class TreeProblem(eqx.Module):
 
     @full_precision
     def log_likelihoods(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, " seen"]:
-        """For each seen node what its datum is given its state, or, at an end, the terms of what
-        leads to it alone.
-        """
+        """For each seen node log p(v | x), or, at an end, the terms of what leads to it alone."""
         schedule, place = self.schedule, {node: i for i, node in enumerate(self.schedule.active)}
         at_inner = np.array([place[node] for node in schedule.inner], int)
         paths, log_weights = self.down(self.up(), noise)
@@ -241,9 +235,7 @@ class TreeProblem(eqx.Module):
         return self.down(self.up(), noise)[0]
 
     def at_nodes(self, paths: Float[Array, "branches K+1 n *dim"]) -> Float[Array, "nodes n *dim"]:
-        """The states of all nodes, from those along the branches; NaN for nodes that lead to
-        nothing seen.
-        """
+        """The states of all nodes, from those along branches; NaN where nothing seen is below."""
         states = jnp.full((len(self.parents), *self.x0.shape), jnp.nan, paths.dtype)
         root = paths[0, 0]  # the first branch, in preorder, starts there
         return states.at[np.array(self.schedule.active)].set(paths[:, -1]).at[0].set(root)
@@ -333,9 +325,7 @@ class TreeProblem(eqx.Module):
         return self.sde if own is None else eqx.combine(own, self.sde)
 
     def _inner_grid(self, branch: Branch) -> Array:
-        """Times with an entry of a plan at the end too: the last step to an inner node is led like
-        the others.
-        """
+        """Times that give a plan an entry at the end too: there the last step is led as well."""
         ts = self._grid(branch.length, False)
         return jnp.concatenate([ts, ts[-1:]])
 
@@ -356,9 +346,7 @@ class TreeProblem(eqx.Module):
         return self.guide.prepared(self._edge(branch), seen, observed, reference, ts, start)
 
     def _with_steps(self, branches: Branch) -> Branch:
-        """Inner branches with all that can be known before any message, in one program for all of
-        them.
-        """
+        """Inner branches with what is known before any message, in one program for all."""
         guide = self.guide
         if not isinstance(guide, FrozenGuide) or guide.rounds:
             return branches
@@ -433,9 +421,7 @@ class TreeProblem(eqx.Module):
         return UpwardPass(plans, data, ends, at_root)
 
     def _up_with_means(self, ends: Led) -> UpwardPass:
-        """Each branch by the mean of what is seen below, of whatever covariance the process has
-        there.
-        """
+        """Each branch by the mean of what is seen below, whatever the covariance there."""
         first = jax.tree.map(lambda a: a[0], self.branches)
         zero = jnp.zeros((), self.x0.dtype)
         part = Part.of(*self._edge(first).noise(zero, jnp.zeros_like(self.x0)))
@@ -467,9 +453,7 @@ class TreeProblem(eqx.Module):
         return UpwardPass(plans, data, ends, part.message(at_root.information))
 
     def _own_messages(self, messages, of_node):
-        """For each node of the tree what is told by what is seen of it and by the ends that hang on
-        it.
-        """
+        """For each node what is told by its own data and by the ends that hang on it."""
         schedule, count = self.schedule, len(self.parents)
         above = np.array(self.parents)[list(schedule.ends)]
         totals = jax.tree.map(
@@ -515,9 +499,7 @@ class TreeProblem(eqx.Module):
         return jax.tree.map(lambda a, b: a[0] + b[0], own, kept), _picked_out(out, schedule)
 
     def log_evidence(self, up: UpwardPass) -> Float[Array, ""]:
-        """The message at the root under its prior: the log likelihood itself where the process is
-        linear.
-        """
+        """The message at the root under its prior: the log likelihood where all is linear."""
         return self.root.log_evidence(up.at_root)
 
     def down(self, up: UpwardPass, noise: Float[Array, "steps k *dim"]):
@@ -584,9 +566,7 @@ class TreeProblem(eqx.Module):
         return paths, log_weights
 
     def _log_density_inside(self, states):
-        """Log density of what is seen at the root and at inner nodes, given their states; 0 where
-        nothing is.
-        """
+        """Log density of the data of the root and inner nodes given the states; 0 without data."""
         inner = (0, *self.schedule.inner)
         chosen = [i for i, node in enumerate(inner) if node in self.observed]
         if not chosen:

@@ -173,9 +173,7 @@ class Tree(eqx.Module):
 
     @classmethod
     def chain(cls, times: ArrayLike, names: Sequence[str | None] | None = None) -> "Tree":
-        """A time series: nodes one after the other, at `times` `(m,)` since the root, all of them
-        seen.
-        """
+        """A time series: nodes in a row, at `times` `(m,)` since the root, all of them seen."""
         times = _as_vector(times, "times")
         value = concrete(times)
         require(
@@ -207,9 +205,7 @@ class Tree(eqx.Module):
 
     @property
     def active(self) -> tuple[int, ...]:
-        """Numbers of the nodes but the root that lead to something seen: those whose branches have
-        noise.
-        """
+        """Nodes but the root that lead to something seen: those whose branches have noise."""
         return schedule(self.parents, self.observed).active
 
     @property
@@ -328,9 +324,7 @@ class Tree(eqx.Module):
         )
 
     def pruned(self, names: Iterable[str]) -> "Tree":
-        """The tree of these tips alone: branches that meet without a split become one, of the sum
-        of their lengths.
-        """
+        """The tree of these tips alone: branches that meet without a split become one."""
         wanted = {self._number(name) for name in _several(names)}
         inner = wanted - set(self.tips)
         require(
@@ -457,9 +451,7 @@ def _as_parents(parents: Sequence[int]) -> tuple[int, ...]:
 
 
 def _preorder(parents: Sequence[int]) -> list[int]:
-    """Numbers of the nodes, the root first and children in their order; `ValueError` for what is no
-    tree.
-    """
+    """Numbers of the nodes in preorder, children as they come; `ValueError` for what is no tree."""
     array = known_float(parents, "parents")
     count = array.size
     require(
