@@ -16,6 +16,7 @@ import numpy as np
 
 from .._checks import as_path, positive_integer, require, words
 
+# quotes come first: a bracket within them is part of a name; '' within them is a quote
 _QUOTED_OR_COMMENT = re.compile(r"'(?:[^']|'')*'|\[[^\]]*\]")
 _UNROOTED = re.compile(r"(?im)^(\s*)utree\b")
 _TWO_LENGTHS = re.compile(r":[^,();:]*(:)")
@@ -43,6 +44,7 @@ def parse(source: str | PathLike, index: int | None, preserve_underscores: bool)
     text = _without_comments(text)
     if not _is_nexus(text) and not text.rstrip().endswith(";"):
         text = text.rstrip() + ";"  # a file may end without
+    # a colon within quotes belongs to a name
     found = _TWO_LENGTHS.search(_hidden_quotes(text))
     require(
         found is None,
@@ -77,17 +79,21 @@ def _hidden_quotes(text: str) -> str:
 
 
 def _position(text: str, found: re.Match | None) -> str:
+    # group 1 is the second colon; line and column count from 1
     before = text[: found.start(1)] if found else ""
     return f"line {before.count(chr(10)) + 1}, column {len(before) - before.rfind(chr(10))}"
 
 
 def _read(text: str, place: str, preserve_underscores: bool) -> Any:
+    # here, since most programs read no tree
     import dendropy
 
     nexus = _is_nexus(text)
     if nexus:  # PAML writes rooted trees so; DendroPy does not know the word
         text = _UNROOTED.sub(r"\1 tree", text)
+    # names of inner nodes stay labels, where several nodes may have the support 95
     settings = dict(preserve_underscores=preserve_underscores, suppress_internal_node_taxa=True)
+    # a tree without the mark [&R] would be unrooted to DendroPy
     settings |= dict(rooting="force-rooted")
     if not nexus:  # names that are given twice are ours to refuse
         settings |= dict(suppress_leaf_node_taxa=True)
@@ -106,7 +112,8 @@ def _is_nexus(text: str) -> bool:
 
 
 def _nodes(tree: Any) -> Parsed:
-    parsed, number = Parsed([], [], []), {}
+    parsed = Parsed([], [], [])
+    number = {}
     for node in tree.preorder_node_iter():
         number[node] = len(number)
         parsed.parents.append(-1 if node.parent_node is None else number[node.parent_node])
@@ -126,6 +133,7 @@ def _name(node: Any) -> str | None:
 def _is_support(label: str) -> bool:
     """Inner nodes may have supports, `95` or `0.98/100`, where a name would be."""
     try:
+        # `inf` and `nan` are numbers to Python, and may be the names of clades
         return bool(np.all([np.isfinite(float(part)) for part in label.split("/")]))
     except ValueError:
         return False
