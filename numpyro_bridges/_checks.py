@@ -70,7 +70,8 @@ def _is_here(x: Any) -> bool:
 
 def words(value: Any) -> str:
     """A value as an error shows it: on one line, an array by its type and shape."""
-    dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    dtype = getattr(value, "dtype", None)
+    shape = getattr(value, "shape", None)
     if dtype is not None and isinstance(shape, tuple) and (shape or isinstance(value, Tracer)):
         return f"an array of {dtype} of shape {shape}"
     try:

@@ -143,7 +143,8 @@ class Comparison:
 
     def _gap(self, first: str, second: str) -> tuple[float, float, float]:
         """The distance of two log evidences, its standard error, and what rounding explains."""
-        a, b = self.rows[first], self.rows[second]
+        a = self.rows[first]
+        b = self.rows[second]
         joint = math.hypot(a["standard_error"], b["standard_error"])
         return abs(a["log_evidence"] - b["log_evidence"]), joint, a["rounding"] + b["rounding"]
 
@@ -268,7 +269,8 @@ def _check_bridges(bridges) -> None:
     (first, reference), *others = bridges.items()
     for name, bridge in others:
         for field in ("sde", "condition", "x0", "ts", "solver"):
-            mine, theirs = getattr(bridge, field), getattr(reference, field)
+            mine = getattr(bridge, field)
+            theirs = getattr(reference, field)
             require(
                 eqx.tree_equal(mine, theirs),
                 f"`bridges` must have one estimand; {name!r} has another `{field}` than {first!r}"

@@ -51,7 +51,8 @@ def resample(points: ArrayLike, num_points: int, closed: bool = True) -> NDArray
 
     **Raises:** `ValueError` for missing (NaN) points, a curve of no length, or too few points.
     """
-    points, closed = _shape(points, "points"), flag(closed, "closed")
+    points = _shape(points, "points")
+    closed = flag(closed, "closed")
     num_points = positive_integer(num_points, "num_points", least=1 if closed else 2)
     if closed:
         points = np.concatenate([points, points[:1]])
@@ -203,12 +204,14 @@ def procrustes_align(
         return _unit_size(center(points), name) if scale else center(points)
 
     mean = standard(start, "reference" if first is None else f"shapes[{first}]")
-    converged, iteration = False, 0
+    converged = False
+    iteration = 0
     while not converged and iteration < max_iterations:
         iteration += 1
         filled = standard(_fill(shapes, missing, mean), "shapes")
         aligned = filled @ _rotations(filled, mean)
-        previous, mean = mean, standard(aligned.mean(axis=0), "shapes")
+        previous = mean
+        mean = standard(aligned.mean(axis=0), "shapes")
         change = np.sqrt(np.mean(np.sum((mean - previous) ** 2, axis=-1)))
         converged = first is None or bool(change <= tolerance * rms_radius(mean))
     if not converged:
@@ -220,7 +223,8 @@ def procrustes_align(
         )
     if first is not None:
         back = _rotations(aligned[first], filled[first])
-        aligned, mean = aligned @ back, mean @ back
+        aligned = aligned @ back
+        mean = mean @ back
     aligned[missing] = np.nan
     squares = np.sum((aligned - mean) ** 2, axis=-1)
     distances = np.sqrt(np.nanmean(squares, axis=1)) / rms_radius(mean)
@@ -254,7 +258,8 @@ def _least_incomplete(shapes: NDArray, missing: NDArray) -> tuple[int, NDArray]:
             "all. Leave these points out, or give a `reference`."
         )
     first = int(missing.sum(axis=1).argmin())
-    filled, gone = shapes[first].copy(), missing[first].copy()
+    filled = shapes[first].copy()
+    gone = missing[first].copy()
     while gone.any():
         common = np.sum(~gone & ~missing, axis=1)
         common[~np.any(gone & ~missing, axis=1)] = 0  # it has none of those that are sought
@@ -381,7 +386,8 @@ def _fill(shapes: NDArray, missing: NDArray, mean: NDArray) -> NDArray:
     filled = shapes.copy()
     for shape, gone in zip(filled, missing, strict=True):
         if gone.any():
-            seen, mean_seen = center(shape[~gone]), center(mean[~gone])
+            seen = center(shape[~gone])
+            mean_seen = center(mean[~gone])
             rotation = _rotations(mean_seen, seen)
             size = np.sum((mean_seen @ rotation) * seen) / np.sum(mean_seen**2)
             offset = shape[~gone].mean(axis=0)

@@ -167,7 +167,8 @@ def names_of(batched) -> tuple[str, ...] | None:
 
 def _grids(times, batch_shape, **settings):
     """The time grid, or one for each law of a batch, and whether it is one each."""
-    own, shared = {}, {}
+    own = {}
+    shared = {}
     for name, value in times.items():
         shape = () if value is None else np.shape(value)
         inner = shape[len(shape) - 1 :] if name == "ts" else ()
@@ -236,7 +237,9 @@ def _path(parts, value, noise):
 
 
 def _free_path(parts, key):
-    sde, x0, grid = parts["sde"], parts["x0"], parts["ts"]
+    sde = parts["sde"]
+    x0 = parts["x0"]
+    grid = parts["ts"]
     shape = (grid.num_steps, sde.noise_size(x0), x0.shape[1] if x0.ndim == 2 else 1)
     return simulate(sde, x0, grid, jr.normal(key, shape, x0.dtype))
 

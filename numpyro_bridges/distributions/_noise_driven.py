@@ -44,13 +44,18 @@ class AbstractNoiseDriven(dist.Distribution):
         validate_args=None,
         plain=(),
     ):
-        self.parts, self.noise, self._mask = parts, None, None
+        self.parts = parts
+        self.noise = None
+        self._mask = None
         # gets the axes that a transformation puts in front of all arrays
         self._stack = np.zeros(())
-        self._batched, self._declared = batched, declared
+        self._batched = batched
+        self._declared = declared
         # parts made of scalars, which no parameter of a datum can have broadcast
         self._plain = plain
-        self._own_shape, self._noise_shape, self._moved = batch_shape, noise_shape, 0
+        self._own_shape = batch_shape
+        self._noise_shape = noise_shape
+        self._moved = 0
         super().__init__(batch_shape, event_shape, validate_args=validate_args)
         self.refuse_hidden_axes(batch_shape, names=("sde", "match"))
 
@@ -191,7 +196,8 @@ class AbstractNoiseDriven(dist.Distribution):
             "bound. Use `numpyro_bridges.sample(name, law, obs=...)`, the handler `NoiseReparam`, "
             "or `law.given(noise)`.",
         )
-        full, mask = self._full_shape, self._mask
+        full = self._full_shape
+        mask = self._mask
         if mask is not None and not np.any(concrete(mask) if concrete(mask) is not None else True):
             return jnp.zeros(self.batch_shape + inner)
         value = jnp.broadcast_to(value, self.shape())
@@ -245,7 +251,8 @@ class AbstractNoiseDriven(dist.Distribution):
             f"`reinterpreted_batch_ndims` must be a number from 0 to {n}, the number of batch "
             f"axes; got {words(k)}.",
         )
-        batch, moved = self.batch_shape[: n - k], self.batch_shape[n - k :]
+        batch = self.batch_shape[: n - k]
+        moved = self.batch_shape[n - k :]
         return self._replace(
             _batch_shape=batch, _event_shape=moved + self.event_shape, _moved=self._moved + k
         )
@@ -268,7 +275,8 @@ class AbstractNoiseDriven(dist.Distribution):
             return self
         require(broadcasts(old, full), f"a law of batch shape {old} cannot be expanded to {full}.")
         self.refuse_hidden_axes(full, names=("sde", "match"))
-        noise, mask = self.noise, self._mask
+        noise = self.noise
+        mask = self._mask
         if noise is not None:
             require(
                 math.prod(old) == math.prod(full),
@@ -327,7 +335,8 @@ class AbstractNoiseDriven(dist.Distribution):
             f"law of batch {self.batch_shape}. One noise shared by several data is a wrong "
             "likelihood: put the site into a `numpyro.plate`.",
         )
-        data, mask = concrete(value), True if self._mask is None else concrete(self._mask)
+        data = concrete(value)
+        mask = True if self._mask is None else concrete(self._mask)
         if data is not None and mask is not None:
             full = shape[: k + self._moved] if mask is True else self._full_shape
             data = np.broadcast_to(data, full + self.event_shape[self._moved :])

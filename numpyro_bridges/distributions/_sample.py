@@ -111,7 +111,8 @@ def _enumerates(handler) -> bool:
 
 def _drawn_inside(plates) -> tuple[str, tuple[int, ...]]:
     """A site that is drawn inside some of these plates, and the sizes of those plates."""
-    drawn, sizes = "", set()
+    drawn = ""
+    sizes = set()
     for handler in _PYRO_STACK:
         for name, site in handler.trace.items() if isinstance(handler, handlers.trace) else ():
             noise = site["type"] == "sample" and isinstance(

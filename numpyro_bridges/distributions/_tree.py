@@ -147,7 +147,8 @@ class DiffusionTree(AbstractNoiseDriven):
         prior = (
             None if root_covariance is None else as_covariance(root_covariance, "root_covariance")
         )
-        own, own_edges = names_of(per_row) or (), names_of(per_edge) or ()
+        own = names_of(per_row) or ()
+        own_edges = names_of(per_edge) or ()
         require(set(own) <= {"match"}, f"`per_row` may hold 'match'; got {per_row}.")
         require(set(own_edges) <= {"sde"}, f"`per_edge` may hold 'sde'; got {per_edge}.")
         require(
@@ -198,7 +199,8 @@ class DiffusionTree(AbstractNoiseDriven):
     @property
     def noise_blocks(self) -> NoiseBlocks:
         """The root, where it has a prior, and the branches that have noise, in preorder."""
-        tree, num_steps = self.tree, self.parts["settings"].num_steps
+        tree = self.tree
+        num_steps = self.parts["settings"].num_steps
         branches = tree.active
         sizes = tuple(num_steps[node - 1] for node in branches)
         root = self._noise_shape[0] - sum(sizes)
@@ -275,7 +277,8 @@ class DiffusionTree(AbstractNoiseDriven):
     @staticmethod
     def _log_weights(parts, value, noise):
         terms = _problem(parts, value).log_weights(_driving(parts, noise))
-        tree, pieces = parts["tree"], parts["settings"].pieces
+        tree = parts["tree"]
+        pieces = parts["settings"].pieces
         active = np.array(tree.active)
         branch = np.repeat(np.arange(len(active)), pieces[active - 1])
         root = len(terms) - len(branch)  # 1 where it has a prior
@@ -323,7 +326,8 @@ def _first(part):
 
 def _check(parts):
     """Raises unless the parts make one law."""
-    tree, settings = parts["tree"], parts["settings"]
+    tree = parts["tree"]
+    settings = parts["settings"]
     for name in settings.per_row:
         _check_axis(parts[name], len(tree.observed), f"`{name}` is in `per_row`", "row of data")
     for name in settings.per_edge:
@@ -334,7 +338,8 @@ def _check(parts):
                 f"`{name}` must have one space on all branches.",
             )
     check_law(_simplest(parts))
-    prior, n = parts["root_covariance"], parts["x0"].shape[0]
+    prior = parts["root_covariance"]
+    n = parts["x0"].shape[0]
     require(
         prior is None or prior.ndim == 0 or prior.shape[0] == n,
         f"`root_covariance` must be a number, ({n},) or ({n}, {n}), as the state has {n} rows; got "
@@ -354,7 +359,8 @@ def _check_axis(part, size, why, what):
 
 
 def _check_condition(parts, datum):
-    tree, condition = parts["tree"], parts["match"].at(datum[0])
+    tree = parts["tree"]
+    condition = parts["match"].at(datum[0])
     require(
         condition.num_extra_noises == 0 or condition.is_approximated,
         "`match` must see a value at each node, such as `InexactMatch(variance)`: branches are not "
@@ -382,8 +388,12 @@ def _problem(parts, value) -> TreeProblem:
 
 
 def _unled(parts, value) -> TreeProblem:
-    match, x0, tree, settings = parts["match"], parts["x0"], _divided(parts), parts["settings"]
-    sde, sdes = parts["sde"], None
+    match = parts["match"]
+    x0 = parts["x0"]
+    tree = _divided(parts)
+    settings = parts["settings"]
+    sde = parts["sde"]
+    sdes = None
     if "sde" in settings.per_edge:
         pieces = settings.pieces
         branch = np.repeat(np.arange(len(pieces)), pieces)
@@ -398,7 +408,8 @@ def _unled(parts, value) -> TreeProblem:
         )
     if conditions.is_approximated:
         conditions = _anchored(parts, sde, tree, conditions)
-    guide, root = parts["guide"], _root(parts)
+    guide = parts["guide"]
+    root = _root(parts)
     if _is_flat(parts):
         guide = default_guide(sde, x0) if guide is None else guide
         dim = x0.shape[1]
@@ -411,7 +422,8 @@ def _unled(parts, value) -> TreeProblem:
 
 def _anchored(parts, sde: AbstractSDE, tree: Tree, conditions):
     """Conditions approximated near where a Brownian motion would be at each node, to lead paths."""
-    x0, prior = parts["x0"], parts["root_covariance"]
+    x0 = parts["x0"]
+    prior = parts["root_covariance"]
     n = x0.shape[0]
     a = promote(sde.covariance(parts["t0"], x0), 2, n)
     at_root = (
@@ -443,9 +455,11 @@ def _divided(parts) -> Tree:
 
 def _along(parts, by_piece):
     """From `(pieces, steps together + 1, ...)`, at the states of pieces, to whole branches."""
-    settings, active = parts["settings"], np.array(parts["tree"].active)
+    settings = parts["settings"]
+    active = np.array(parts["tree"].active)
     together = settings.steps_together
-    counts, pieces = np.array(settings.num_steps)[active - 1], settings.pieces[active - 1]
+    counts = np.array(settings.num_steps)[active - 1]
+    pieces = settings.pieces[active - 1]
     first = np.cumsum(pieces) - pieces
     state = np.arange(max(counts) + 1)
     piece = np.maximum(state - 1, 0) // together  # that it is in or at the end of
@@ -493,9 +507,12 @@ def _nodes(parts, value, noise):
 def _simulated(parts, key):
     """What is seen, and the paths of the branches that lead to it."""
     key_path, key_seen = jr.split(key)
-    tree, match, own = _divided(parts), parts["match"], parts["settings"].per_row
+    tree = _divided(parts)
+    match = parts["match"]
+    own = parts["settings"].per_row
     problem = _without_data(parts)
-    sde, x0 = problem.sde, problem.x0
+    sde = problem.sde
+    x0 = problem.x0
     shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])
     paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))
     ends = _unflat(parts, problem.at_nodes(paths)[np.array(tree.observed)])

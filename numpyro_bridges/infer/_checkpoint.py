@@ -154,7 +154,10 @@ class _Chains:
     def __init__(
         self, mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh
     ):
-        self.mcmc, self.args, self.kwargs, self.interval = mcmc, args, kwargs, interval
+        self.mcmc = mcmc
+        self.args = args
+        self.kwargs = kwargs
+        self.interval = interval
         self.sampler = copy.copy(mcmc.sampler)  # `init` leaves functions in it
         names = dict.fromkeys([mcmc._sample_field, *mcmc._default_fields, *extra_fields])
         self.fields = [name for name in names if not name.startswith("~")]
@@ -282,10 +285,12 @@ def _over_chains(mcmc, mesh, fn, jit=lambda fn: fn):
     if mesh is None and (mcmc.num_chains == 1 or method == "vectorized"):
         return jit(fn)
     if mesh is not None or method == "parallel":
-        jit, method = jax.jit, partial(spread, mesh=mesh)
+        jit = jax.jit
+        method = partial(spread, mesh=mesh)
     if not isinstance(method, str):
         return jit(lambda x, common: method(lambda x: fn(x, common))(x))
-    one, stack = jit(fn), partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
+    one = jit(fn)
+    stack = partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
     return lambda x, common: stack(*[one(_chain(x, c), common) for c in range(mcmc.num_chains)])
 
 
@@ -394,7 +399,8 @@ def _load_state(folder, chains):
         {"iterations", "settings", "start"} <= set(stored),
         f"{file} is of another program. Choose another `path`.",
     )
-    old, new = json.loads(str(stored["settings"])), chains.settings
+    old = json.loads(str(stored["settings"]))
+    new = chains.settings
     for name in dict.fromkeys([*new, *old]):
         require(
             old.get(name) == new.get(name),
@@ -439,8 +445,10 @@ def _load_draws(folder, chains, done) -> dict:
 
 def _hand_over(folder, chains, state, done) -> None:
     """Leaves `mcmc` as after `run`."""
-    draws, mcmc = _load_draws(folder, chains, done), chains.mcmc
-    mcmc._args, mcmc._kwargs = chains.args, chains.kwargs
+    draws = _load_draws(folder, chains, done)
+    mcmc = chains.mcmc
+    mcmc._args = chains.args
+    mcmc._kwargs = chains.kwargs
     mcmc._last_state = jax.tree.map(jnp.asarray, state)
     mcmc._states = jax.tree.map(jnp.asarray, _rebuilt(draws, chains.draw)) if draws else None
     mcmc._states_flat = None

@@ -55,7 +55,8 @@ from ._rotation import choose, half_square, metropolis, normal_like, trajectory
 _ESS = 0.5
 """Between neighbouring temperatures, of the pilot's particles: a fraction of their number."""
 _ACCEPTANCE = 0.8
-_LENGTH, _JITTER = 1.6, 0.2
+_LENGTH = 1.6
+_JITTER = 0.2
 """Angle of a trajectory, in radians: about π/2, which forgets a standard normal."""
 _MAX_STEPS = 32
 _LEAST_CHANGE = 1e-4
@@ -109,7 +110,8 @@ class TemperedEvidence(eqx.Module):
 
     def __str__(self) -> str:
         found = f"log evidence {float(self.log_evidence):.4g} ± {float(self.standard_error):.2g}"
-        runs, count = len(self.log_estimates), len(self.inverse_temperatures) - 1
+        runs = len(self.log_estimates)
+        count = len(self.inverse_temperatures) - 1
         of = f"{runs} islands of {self.num_particles} particles"
         if self.method == "bridge":
             of = f"{runs} chains of {self.num_particles} draws"
@@ -243,7 +245,9 @@ class _Run:
     """The programs of one model."""
 
     def __init__(self, model, model_args, model_kwargs, batch_size: int, mesh: Mesh | None):
-        self._model, self._args, self._kwargs = model, model_args, model_kwargs
+        self._model = model
+        self._args = model_args
+        self._kwargs = model_kwargs
         sites = {
             name: site
             for name, site in sites_of(model, model_args, model_kwargs).items()
@@ -253,7 +257,8 @@ class _Run:
         self._noise = {name for name, site in sites.items() if is_noise(site)}
         self._unravel = self._parts(_unconstrained(sites))[2]
         self._spread = partial(spread, mesh=mesh, batch_size=batch_size)
-        start, move = jax.jit(self._start), jax.jit(self._move, static_argnames="num_moves")
+        start = jax.jit(self._start)
+        move = jax.jit(self._move, static_argnames="num_moves")
         self.start = lambda keys: gather(start(keys))
         self.move = lambda *args: gather(move(*args))
         self.resample = jax.jit(_resampled)
@@ -275,7 +280,8 @@ class _Run:
         """The reference of the parameters of all particles."""
         theta = jax.vmap(lambda z: self._parts(z)[0])(z)
         mean = jnp.mean(theta, 0)
-        rest, start = theta - mean, Reference(mean, jnp.eye(mean.size, dtype=mean.dtype))
+        rest = theta - mean
+        start = Reference(mean, jnp.eye(mean.size, dtype=mean.dtype))
         return (
             if_finite(from_moments(mean, rest.T @ rest, len(theta)), start) if mean.size else start
         )
@@ -374,7 +380,10 @@ def _pilot(run: _Run, key, num_particles, num_moves, bar):
     """Particles of the posterior, a stage for each temperature, and acceptances."""
     key, key_start = jr.split(key)
     particles = run.start(jr.split(key_start, num_particles))
-    beta, step, stages, rates = 0.0, _LENGTH / 2, [], []
+    beta = 0.0
+    step = _LENGTH / 2
+    stages = []
+    rates = []
     while beta < 1:
         key, key_resample, key_move = jr.split(key, 3)
         new = _next_beta(beta, np.asarray(particles.log_likelihood, float))
@@ -409,7 +418,8 @@ def _next_beta(beta: float, log_likelihood) -> float:
 
     if enough(1 - beta):
         return 1.0
-    low, high = _LEAST_CHANGE, 1 - beta
+    low = _LEAST_CHANGE
+    high = 1 - beta
     for _ in range(40):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if enough(middle) else (low, middle)
@@ -420,11 +430,13 @@ def _island(run: _Run, key, stages, num_particles, num_moves, bar) -> Array:
     """The log evidence that one set of particles gives; its exponential is unbiased."""
     key, key_start = jr.split(key)
     particles = run.start(jr.split(key_start, num_particles))
-    log_evidence, beta = jnp.zeros(()), 0.0
+    log_evidence = jnp.zeros(())
+    beta = 0.0
     for stage in stages:
         key, key_resample, key_move = jr.split(key, 3)
         particles, log_mean = run.resample(particles, key_resample, stage.beta - beta)
-        log_evidence, beta = log_evidence + log_mean, stage.beta
+        log_evidence = log_evidence + log_mean
+        beta = stage.beta
         if stage is not stages[-1]:
             particles, _, _ = run.move(particles, key_move, stage, num_moves)
         jax.block_until_ready(particles)

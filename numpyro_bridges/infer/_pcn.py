@@ -125,7 +125,9 @@ class AbstractPCN(AbstractBridgeKernel):
         self._cuts = self._cut(z)
         energies, force = self._evaluate(z, model_args, model_kwargs)
         angles = tuple(jnp.full_like(energy, self._angle) for energy in energies)
-        i, zero, no = jnp.array(0), jnp.zeros_like(total(energies)), jnp.array(False)
+        i = jnp.array(0)
+        zero = jnp.zeros_like(total(energies))
+        no = jnp.array(False)
         return PCNState(
             i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key, UNSEALED
         )
@@ -183,7 +185,8 @@ class AbstractPCN(AbstractBridgeKernel):
     def _move(self, key, m, state, still, model_args, model_kwargs):
         """Turns the noise of one block, or one level of a tree, and decides for each datum."""
         key_p, key_accept = jr.split(key)
-        old, groups = state.z, groups_of(state.z, self._owners)
+        old = state.z
+        groups = groups_of(state.z, self._owners)
         number = state.i * self._num_moves + m
         turns = {
             name: cut.turns(number, jnp.where(still, 0.0, angle), old[name])
@@ -195,7 +198,10 @@ class AbstractPCN(AbstractBridgeKernel):
         energies, force = self._evaluate(new, model_args, model_kwargs)
         _, after = _kicked(p, force, turns)
 
-        accept, decisions, rates, asked = {}, [], [], []
+        accept = {}
+        decisions = []
+        rates = []
+        asked = []
         for key, group, cut, e_new, e_old in zip(
             jr.split(key_accept, len(groups)),
             groups,
@@ -353,7 +359,8 @@ class _TreeBlocks(AbstractBlocks):
 
     def __init__(self, blocks: NoiseBlocks, whole_clades: bool):
         above = blocks.above
-        self._count, self._whole_clades = len(above), whole_clades
+        self._count = len(above)
+        self._whole_clades = whole_clades
         self._rows = np.repeat(np.arange(len(above)), blocks.sizes)
         lineages = []
         for i, parent in enumerate(above):

@@ -99,7 +99,8 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         return self._num_particles
 
     def get_diagnostics_str(self, state):
-        step, rate = float(state.step_size), float(state.mean_accept_prob)
+        step = float(state.step_size)
+        rate = float(state.mean_accept_prob)
         return f"{self._num_particles} particles, step size {step:.2e}. acc. prob={rate:.2f}"
 
     def _check(self, model_args, model_kwargs):
@@ -150,8 +151,10 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         (value, energies), force = self._evaluate(potential, theta)
         z = unravel(theta) | self._pick(key_pick, particles, energies)
         step = self._best_step(theta.size) if self._step_size is None else self._step_size
-        zero, no = jnp.zeros_like(value), jnp.array(False)
-        windows, i = start_windows(reference), jnp.array(0)
+        zero = jnp.zeros_like(value)
+        no = jnp.array(False)
+        windows = start_windows(reference)
+        i = jnp.array(0)
         step = jnp.asarray(step, value.dtype)
         return PseudoMarginalState(
             i, z, particles, value, force, step, windows, zero, zero, no, key, UNSEALED

@@ -96,7 +96,8 @@ def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
         step = choose(good, length * full, 0.5 * step)
         return _Search(x, value, slope, inverse, step, count + 1)
 
-    infinite, none = jnp.asarray(jnp.inf, x.dtype), jnp.zeros_like(x)
+    infinite = jnp.asarray(jnp.inf, x.dtype)
+    none = jnp.zeros_like(x)
     start = _Search(x, infinite, none, jnp.eye(x.size, dtype=x.dtype), none, jnp.zeros((), int))
     found = jax.lax.while_loop(go_on, body, start)
     return jnp.where(jnp.isfinite(found.value), found.x, jnp.nan), found.inverse

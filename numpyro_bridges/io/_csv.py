@@ -161,7 +161,8 @@ def write_csv(
     choice(layout, "layout", ("wide", "long"))
     check_delimiter(delimiter)
     _check_table(specimens, layout)
-    shape, notes = specimens[0].landmarks.shape, list(specimens[0].notes)
+    shape = specimens[0].landmarks.shape
+    notes = list(specimens[0].notes)
     axes = "xyz"[: shape[1]]
     if layout == "wide":
         header = ["id", *notes, *(f"{axis}{i}" for i in range(1, shape[0] + 1) for axis in axes)]
@@ -462,7 +463,8 @@ def _wide(table: Table, points: _Points, columns: list[str], id: str | None) -> 
 def _long(
     table: Table, points: _Points, columns: list[str], id: str | None, point: str
 ) -> list[Specimen]:
-    column, order = _id_column(table, id), table.column(point)
+    column = _id_column(table, id)
+    order = table.column(point)
     if order is None and point != "point":
         fail(
             table.path,
@@ -540,7 +542,8 @@ def _check_order(table: Table, groups: dict[str | None, list[Row]], others: list
                     f"Pass `point={name!r}` if that numbers the points, or sort the rows and add "
                     "NA for missing points."
                 )
-                one, other = ", ".join(first[1][:6]), ", ".join(values[:6])
+                one = ", ".join(first[1][:6])
+                other = ", ".join(values[:6])
                 found = f"{one} for {first[0]!r} and {other} for {id!r}"
                 fail(
                     table.path, groups[id][0].line, f"one order of points in {name!r}", found, cure

@@ -50,7 +50,8 @@ def read_nts(path: str | PathLike, *, encoding: str = "utf-8") -> list[Specimen]
     if header is None:
         cure = "It says: 1, the rows, the columns, whether some are missing and their code, DIM=."
         fail(path, began, "a line such as 1 10L 20 0 DIM=2", repr(first), cure)
-    num_rows, num_columns = int(header["rows"]), int(header["columns"])
+    num_rows = int(header["rows"])
+    num_columns = int(header["columns"])
     dim = int(header["dim"] or num_columns)
     if dim not in (2, 3) or num_columns == 0 or num_columns % dim:
         cure = "Write DIM=2 or DIM=3 at the end of the line."
@@ -81,7 +82,8 @@ class _Tokens:
     """The words of a file, and the line that the last of them was on."""
 
     def __init__(self, path: str | PathLike, content: list[tuple[int, str]], num_lines: int):
-        self.path, self.num_lines = path, num_lines
+        self.path = path
+        self.num_lines = num_lines
         self.line = num_lines
         self._rest: Iterator = ((i, word) for i, line in content for word in line.split())
 

@@ -105,7 +105,8 @@ def _from_fcsv(path: str | PathLike, content: str) -> Specimen:
         fail(path, 1, "columns x, y, z", ",".join(columns), "Save the markups again.")
     if columns == list(_COLUMNS[:14]):
         columns = list(_COLUMNS)
-    landmarks, labels = [], []
+    landmarks = []
+    labels = []
     for i, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue

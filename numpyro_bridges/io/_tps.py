@@ -146,7 +146,8 @@ def _specimen(lines: _Lines, negative_is_missing: bool) -> Specimen:
             "LM=, LM3= or POINTS= only, as many as these say."
         )
         lines.fail("LM= or LM3=", cure)
-    dim, began = _BLOCKS[key], lines.number
+    dim = _BLOCKS[key]
+    began = lines.number
     landmarks = _rows(lines, key, _count(lines), dim)
     if negative_is_missing:
         landmarks[(landmarks < 0.0).any(axis=1)] = np.nan

@@ -7,7 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import as_path, known_float, require, words
 
-START, TARGET, ACCENT, NEUTRAL = "#003f5c", "#d55e00", "#0072b2", "#8a8a8a"
+START = "#003f5c"
+TARGET = "#d55e00"
+ACCENT = "#0072b2"
+NEUTRAL = "#8a8a8a"
 
 
 def pyplot() -> Any:

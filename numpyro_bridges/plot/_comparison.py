@@ -11,7 +11,8 @@ from ._canvas import ACCENT, NEUTRAL, START, as_file, pyplot
 
 def draw_comparison(rows: Mapping[str, Mapping[str, float | bool]], path: Any) -> Any:
     """The rows of a `Comparison` as three panels, written to a file; the `Figure`, closed."""
-    plt, path = pyplot(), as_file(path, "path")
+    plt = pyplot()
+    path = as_file(path, "path")
     size = (8.0, 1.0 + 0.42 * len(rows))
     figure, axes = plt.subplots(
         1, 3, figsize=size, sharey=True, layout="constrained", width_ratios=[1.4, 1, 1.2]

@@ -59,9 +59,11 @@ def deformation(
     margin = known_number(margin, "margin", "a number from 0 on", lambda value: value >= 0)
     closed = flag(closed, "closed")
     first, last = (np.asarray(flow.space.to_points(path[i])) for i in (0, -1))
-    low, high = first.min(axis=0), first.max(axis=0)
+    low = first.min(axis=0)
+    high = first.max(axis=0)
     size = (high - low).max()
-    low, high = low - margin * size, high + margin * size
+    low = low - margin * size
+    high = high + margin * size
     counts = np.maximum(np.ceil(num_lines * (high - low) / (high - low).max()).astype(int), 2)
     sides = [np.linspace(low[i], high[i], _PER_CELL * (counts[i] - 1) + 1) for i in range(2)]
     points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)

@@ -72,7 +72,8 @@ def path(
     """
     path = as_points(path, "path", "(K + 1, n, 2)")
     times = as_times(ts, len(path))
-    closed, trajectories = flag(closed, "closed"), flag(trajectories, "trajectories")
+    closed = flag(closed, "closed")
+    trajectories = flag(trajectories, "trajectories")
     num_outlines = positive_integer(num_outlines, "num_outlines")
     ax = shape_axes(ax, path)
     if trajectories:
@@ -121,15 +122,18 @@ def bridge_fan(
     **Returns:** one `LineCollection` of outlines for each frame.
     """
     max_outlines = positive_integer(max_outlines, "max_outlines")
-    num_frames, closed = positive_integer(num_frames, "num_frames"), flag(closed, "closed")
+    num_frames = positive_integer(num_frames, "num_frames")
+    closed = flag(closed, "closed")
     choice(direction, "direction", ("row", "column"))
     paths = as_points(paths, "paths", "(S, K + 1, n, 2)")[:max_outlines]
-    start, target = as_points(start, "start", "(n, 2)"), as_points(target, "target", "(n, 2)")
+    start = as_points(start, "start", "(n, 2)")
+    target = as_points(target, "target", "(n, 2)")
     times = as_times(ts, paths.shape[1])
     wanted = np.linspace(times[0], times[-1], num_frames)
     chosen = [int(np.abs(times - time).argmin()) for time in wanted]
     corners = np.concatenate([seen(paths[:, chosen]), seen(start), seen(target)])
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
     step = (high - low) * ([1.12, 0.0] if direction == "row" else [0.0, -1.25])
     strip = np.stack([low, high]) + step * np.arange(num_frames)[:, None, None]
     ax = shape_axes(ax, strip, size=(2.2 if direction == "row" else 1.6) * num_frames)
@@ -139,7 +143,8 @@ def bridge_fan(
     for frame, index in enumerate(chosen):
         shift = frame * step
         fan = {"colors": [colors[frame]], "linewidths": 0.8, "alpha": _opacity(len(paths))}
-        first, last = frame == 0, frame == num_frames - 1
+        first = frame == 0
+        last = frame == num_frames - 1
         drawn.append(draw(ax, paths[:, index] + shift, closed, **fan))
         draw(
             ax,
@@ -190,7 +195,8 @@ def score_field(
 
     **Returns:** the `Quiver`.
     """
-    points, arrows = as_points(points, "points", "(n, 2)"), as_points(arrows, "arrows", "(n, 2)")
+    points = as_points(points, "points", "(n, 2)")
+    arrows = as_points(arrows, "arrows", "(n, 2)")
     if arrows.shape != points.shape:
         raise ValueError(
             f"`arrows` must have the shape of `points` {points.shape}, got {arrows.shape}."

@@ -52,9 +52,11 @@ def tree(
     **Returns:** the `LineCollection` of the branches, one for each node but the root.
     """
     require_instance(tree, Tree, "tree", "a `Tree`, such as `Tree.from_newick(text)`")
-    closed, max_outlines = flag(closed, "closed"), positive_integer(max_outlines, "max_outlines")
+    closed = flag(closed, "closed")
+    max_outlines = positive_integer(max_outlines, "max_outlines")
     size = known_number(size, "size", "a positive number of inches", lambda value: value > 0)
-    x, y = known_float(tree.depths, "tree.lengths"), _rows(tree)
+    x = known_float(tree.depths, "tree.lengths")
+    y = _rows(tree)
     clouds = _by_node(tree, draws, "draws", "(S, num_nodes, n, 2)", "(S, n, 2)")
     clouds = {node: cloud[_spaced(len(cloud), max_outlines)] for node, cloud in clouds.items()}
     outlines = {node: np.mean(cloud, axis=0) for node, cloud in clouds.items()}

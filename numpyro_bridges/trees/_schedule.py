@@ -88,7 +88,8 @@ def schedule(parents: Sequence[int], observed: Sequence[int]) -> Schedule:
 
 def _heavy_last(children: dict[int, list[int]], size: np.ndarray) -> list[int]:
     """Inner nodes depth first, of siblings that with the largest subtree last."""
-    order, waiting = [], [0]
+    order = []
+    waiting = [0]
     while waiting:
         node = waiting.pop()
         if node:

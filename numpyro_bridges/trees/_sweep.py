@@ -301,7 +301,8 @@ class TreeProblem(eqx.Module):
         # branch after branch in preorder: simulation is rare, and needs no schedule
         def step(states, inputs):
             node, parent, branch, is_end, z = inputs
-            x, edge = states[parent], self._edge(branch)
+            x = states[parent]
+            edge = self._edge(branch)
             ts = jnp.where(
                 is_end,
                 self._grid(branch.length, self.conditions.exact),

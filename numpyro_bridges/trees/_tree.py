@@ -341,7 +341,9 @@ class Tree(eqx.Module):
         # the root stays, even with one child: the process starts there
         kept = [node for node in needed if node == 0 or node in wanted or children[node] > 1]
         place = {node: i for i, node in enumerate(kept)}
-        parents, branches, owners = [-1], [], []
+        parents = [-1]
+        branches = []
+        owners = []
         for node in kept[1:]:
             owner = place[node]
             above = node
@@ -484,7 +486,8 @@ def _preorder(parents: Sequence[int]) -> list[int]:
         if parent >= 0:
             children[parent].append(node)
     # a stack, since a recursion has no room for a chain of a thousand nodes
-    order, waiting = [], [int(roots[0])]
+    order = []
+    waiting = [int(roots[0])]
     while waiting:
         node = waiting.pop()
         order.append(node)
