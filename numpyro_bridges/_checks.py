@@ -46,6 +46,7 @@ _DTYPES: dict[Any, str | None] = {  # a time difference is an integer to NumPy: 
     jnp.integer: None,
 }
 
+# looked at before numbers are, since a boolean is an integer to Python
 _TYPES: dict[tuple[type, ...], str] = {
     (bool,): "boolean",
     (str, bytes): "text",
@@ -72,6 +73,7 @@ def words(value: Any) -> str:
     """A value as an error shows it: on one line, an array by its type and shape."""
     dtype = getattr(value, "dtype", None)
     shape = getattr(value, "shape", None)
+    # a known scalar by its value; a traced one has none
     if dtype is not None and isinstance(shape, tuple) and (shape or isinstance(value, Tracer)):
         return f"an array of {dtype} of shape {shape}"
     try:
@@ -131,11 +133,13 @@ def _real(x: Any, name: str) -> jax.Array | np.ndarray:
     if kind is not None:
         _refuse(x, name, kind)
     try:
+        # NumPy cannot hold a traced number, so that a list with one becomes a traced array
         if any(isinstance(leaf, Tracer) for leaf in _leaves(x)):
             return x if isinstance(x, Tracer) else jnp.asarray(x, float)
         if isinstance(x, jax.Array):
             return x
         array = np.asarray(x)
+        # of numbers that NumPy has no type for, such as fractions and integers of 100 digits
         return array.astype(float) if array.dtype == object else array
     except OverflowError as e:
         raise ValueError(
@@ -161,6 +165,7 @@ def _leaves(x: Any):
 
 def _kind(x: Any) -> str | None:
     """What x is, if no real number and no array of them: a key of `_CURES`."""
+    # entries one by one: an array of them would have one type, and [1, True] be two numbers
     if isinstance(x, (list, tuple)):
         return next((kind for kind in map(_kind, x) if kind is not None), None)
     for types, kind in _TYPES.items():
@@ -184,6 +189,7 @@ def _kind(x: Any) -> str | None:
 
 def _converted(x: jax.Array | np.ndarray, dtype: Any, name: str) -> jax.Array:
     """x in another precision; `ValueError` for a finite number that would become infinite."""
+    # a JAX array may be traced, and has a float type; what NumPy holds is looked at
     if isinstance(x, jax.Array):
         return jnp.asarray(x, dtype)
     with np.errstate(over="ignore"):
@@ -210,6 +216,7 @@ def positive_integer(value: Any, name: str, least: int = 1) -> int:
     kind = "a positive integer" if least == 1 else f"an integer, at least {least}"
     message = f"`{name}` must be {kind}; got {words(value)}. It is known before tracing."
     require(not isinstance(value, bool), message)
+    # not `int`, which takes 2.7 for 2, and text for a number
     try:
         size = operator.index(value)
     except TypeError as e:
@@ -251,6 +258,7 @@ def known_number(
 ) -> float:
     """A finite setting, known before tracing, that meets a rule in the precision in use."""
     number = known_float(value, name)
+    # 1e-50 is positive, and 0 in single precision
     with np.errstate(over="ignore", under="ignore"):
         rounded = number.astype(jnp.result_type(float))
     require(
@@ -286,8 +294,10 @@ def require_key(key: Any, name: str = "key", several: bool = False) -> None:
     require(isinstance(key, (jax.Array, np.ndarray)), message)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     if not typed:
+        # how many words a raw key has depends on the generator that JAX is set to
         raw = jax.eval_shape(jax.random.PRNGKey, 0)
         require(key.dtype == raw.dtype and key.shape[-1:] == raw.shape, message)
+    # a raw key has an axis of words, which does not count
     require(
         key.ndim - (not typed) in ((0, 1) if several else (0,)),
         f"`{name}` must be one random key; got {words(key)}, several. Use vmap over them, or one "

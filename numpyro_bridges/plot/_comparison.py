@@ -29,19 +29,16 @@ def draw_comparison(rows: Mapping[str, Mapping[str, float | bool]], path: Any) -
         axes[0], column("log_evidence"), column("standard_error"), column("trusted") > 0, colors
     )
     _bars(axes[1], 100 * column("ess_fraction"), colors, "ESS, %")
-    run, total = (column("seconds_per_effective_sample" + end) for end in ("", "_with_training"))
+    run = column("seconds_per_effective_sample")
+    total = column("seconds_per_effective_sample_with_training")
     trained = bool(np.any(total > run))
+    # the longer bars first, in a pale colour: those of the run cover their beginnings
     if trained:
         axes[2].barh(range(len(rows)), _finite(total), height=0.5, color=ACCENT, alpha=0.35)
-    _bars(
-        axes[2],
-        run,
-        colors,
-        "seconds per effective sample" + trained * "\n(pale: with training)",
-        total,
-    )
+    label = "seconds per effective sample" + trained * "\n(pale: with training)"
+    _bars(axes[2], run, colors, label, total)
     axes[0].set_yticks(range(len(rows)), list(rows))
-    axes[0].set_ylim(len(rows) - 0.4, -0.6)
+    axes[0].set_ylim(len(rows) - 0.4, -0.6)  # the first row at the top
     figure.savefig(path, dpi=150)
     plt.close(figure)
     return figure
@@ -53,9 +50,9 @@ def _evidences(ax, values: NDArray, errors: NDArray, trusted: NDArray, colors: l
             error = 2 * errors[i] if np.isfinite(errors[i]) else None
             ax.errorbar(values[i], i, xerr=error, color=color, marker="o", markersize=4, capsize=3)
         if not trusted[i]:
-            words = (
-                "not to be trusted" if np.isfinite(values[i]) else f"{values[i]}, not to be trusted"
-            )
+            # where there is no point to be grey, the value is said
+            value = "" if np.isfinite(values[i]) else f"{values[i]}, "
+            words = f"{value}not to be trusted"
             place = {"xycoords": ("axes fraction", "data"), "ha": "left", "va": "bottom"}
             ax.annotate(words, (0.02, i - 0.12), fontsize=7, color=NEUTRAL, **place)
     ax.set_xlabel("log evidence ± 2 SE", fontsize=9)

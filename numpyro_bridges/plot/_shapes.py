@@ -32,14 +32,8 @@ def outlines(
     style: dict[str, Any] = {"alpha": _opacity(len(shapes))} | kwargs
     lines = draw(ax, shapes, closed, colors=color, linewidths=linewidth, **style)
     if mean is not None:
-        draw(
-            ax,
-            as_points(mean, "mean", "(n, 2)")[None],
-            closed,
-            colors=START,
-            linewidths=2.0,
-            zorder=3,
-        )
+        mean = as_points(mean, "mean", "(n, 2)")
+        draw(ax, mean[None], closed, colors=START, linewidths=2.0, zorder=3)
     return lines
 
 
@@ -77,14 +71,14 @@ def path(
     num_outlines = positive_integer(num_outlines, "num_outlines")
     ax = shape_axes(ax, path)
     if trajectories:
-        draw(
-            ax, path.transpose(1, 0, 2), False, colors=NEUTRAL, linewidths=0.5, alpha=0.5, zorder=1
-        )
+        ways = path.transpose(1, 0, 2)  # a polygon for each point
+        draw(ax, ways, False, colors=NEUTRAL, linewidths=0.5, alpha=0.5, zorder=1)
+    # each once, where there are fewer states than outlines
     chosen = np.unique(np.linspace(0, len(path) - 1, num_outlines).round().astype(int))
     widths = np.where(np.isin(chosen, (0, len(path) - 1)), 2.2, 1.0)
-    lines = draw(
-        ax, path[chosen], closed, linewidths=widths, cmap=cmap or time_map(), zorder=2, **kwargs
-    )
+    cmap = cmap or time_map()
+    lines = draw(ax, path[chosen], closed, linewidths=widths, cmap=cmap, zorder=2, **kwargs)
+    # colours by times, whatever the steps of the grid
     lines.set_array(times[chosen])
     lines.set_clim(times[0], times[-1])
     return lines
@@ -131,6 +125,7 @@ def bridge_fan(
     times = as_times(ts, paths.shape[1])
     wanted = np.linspace(times[0], times[-1], num_frames)
     chosen = [int(np.abs(times - time).argmin()) for time in wanted]
+    # all frames are on the same axes, each shifted by the box around all that is drawn in any
     corners = np.concatenate([seen(paths[:, chosen]), seen(start), seen(target)])
     low = corners.min(axis=0)
     high = corners.max(axis=0)
@@ -146,30 +141,15 @@ def bridge_fan(
         first = frame == 0
         last = frame == num_frames - 1
         drawn.append(draw(ax, paths[:, index] + shift, closed, **fan))
-        draw(
-            ax,
-            (start + shift)[None],
-            closed,
-            colors=START,
-            linewidths=2.2 if first else 0.9,
-            zorder=3,
-        )
-        dashes = "-" if last else (0, (4, 2))
+        width = 2.2 if first else 0.9
+        draw(ax, (start + shift)[None], closed, colors=START, linewidths=width, zorder=3)
         width = 2.2 if last else 0.9
-        draw(
-            ax,
-            (target + shift)[None],
-            closed,
-            colors=TARGET,
-            linewidths=width,
-            linestyles=dashes,
-            zorder=4,
-        )
+        dashed = {"linestyles": "-" if last else (0, (4, 2)), "zorder": 4}
+        draw(ax, (target + shift)[None], closed, colors=TARGET, linewidths=width, **dashed)
         below = ((low[0] + high[0]) / 2.0 + shift[0], low[1] + shift[1])
         label = f"$t = {times[index]:.2g}$"
-        ax.annotate(
-            label, below, (0, -5), textcoords="offset points", ha="center", va="top", fontsize=9
-        )
+        style: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 9}
+        ax.annotate(label, below, (0, -5), textcoords="offset points", **style)
     return drawn
 
 
@@ -210,8 +190,10 @@ def score_field(
     ax = shape_axes(ax, np.concatenate([points, points + drawn]))
     draw(ax, points[None], closed, colors=NEUTRAL, linewidths=1.2, zorder=1)
     ax.plot(*points.T, linestyle="none", marker="o", markersize=2.5, color=START, zorder=2)
+    # matplotlib counts the feet of arrows for the limits, and not the tips
     ax.update_datalim(points + drawn)
     ax.autoscale_view()
+    # in the units of the points: matplotlib scales arrows by the axes otherwise
     settings = dict(
         angles="xy", scale_units="xy", scale=1.0, width=0.0045, headwidth=3.5, headlength=4.5
     )
