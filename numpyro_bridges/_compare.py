@@ -370,12 +370,12 @@ def _cells(row) -> list[str]:
 
 def _aligned(table: list[list[str]]) -> list[str]:
     """Lines of a table, the first column to the left and the others to the right."""
-    # a combining hat takes no room
-    hats = [[cell.count("\u0302") for cell in line] for line in table]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = []
-    for line, extra in zip(table, hats, strict=True):
-        (name, name_width), *others = zip(line, np.add(widths, extra), strict=True)
+    for line in table:
+        # a combining hat takes no room
+        hats = [cell.count("\u0302") for cell in line]
+        (name, name_width), *others = zip(line, np.add(widths, hats), strict=True)
         numbers = [cell.rjust(width) for cell, width in others]
         lines.append("  ".join([name.ljust(name_width), *numbers]))
     return lines

@@ -215,6 +215,7 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
     if delimiter is not None:
         check_delimiter(delimiter)
     content = read_text(path, encoding)
+    # lines above the table, which count for the numbers of lines in messages
     above = re.findall(r"\A(?:(?:sep=.|#.*)\n)*", content.replace("\r\n", "\n"))[0].splitlines()
     content = content.split("\n", len(above))[-1]
     said = [line[4] for line in above if line.startswith("sep=")]  # for a spreadsheet program
@@ -232,9 +233,7 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
     kept = [j for j, name in enumerate(header) if name or j == 0]
     _check_cells(path, records, len(header), kept)
     header = [header[j] for j in kept]
-    twice = [name for name, count in Counter(header).items() if count > 1]
-    if twice:
-        fail(path, 1, "different names of columns", f"{twice[0]!r} twice", "Rename one of them.")
+    _check_different(path, header)
     rows = []
     for line, cells in records:
         named = {name: cells[j] for name, j in zip(header, kept, strict=True)}
@@ -274,6 +273,12 @@ def _header(
     if _has_axes(names, len(first)):  # the header is a comment, as NumPy writes it
         return [name.strip() for name in names], records, False
     return [str(j + 1) for j in range(len(first))], records, True
+
+
+def _check_different(path: str | PathLike, header: list[str]) -> None:
+    twice = [name for name, count in Counter(header).items() if count > 1]
+    if twice:
+        fail(path, 1, "different names of columns", f"{twice[0]!r} twice", "Rename one of them.")
 
 
 def _check_cells(path: str | PathLike, records: _Records, count: int, kept: list[int]) -> None:
@@ -498,14 +503,12 @@ def _wide(table: Table, points: _Points, columns: list[str], id: str | None) -> 
     if column is None and id is not None and "" in table.header:
         column = ""
     others = [name for name in table.header if name and name not in columns and name != column]
-    return [
-        Specimen(
-            points[row.line],
-            id=None if column is None else row.cells[column] or None,
-            notes={name: row.cells[name] for name in others},
-        )
-        for row in table.rows
-    ]
+    specimens = []
+    for row in table.rows:
+        name = None if column is None else row.cells[column] or None
+        notes = {name: row.cells[name] for name in others}
+        specimens.append(Specimen(points[row.line], id=name, notes=notes))
+    return specimens
 
 
 def _long(

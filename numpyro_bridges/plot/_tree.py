@@ -66,11 +66,7 @@ def tree(
     # around the middle of the shape, and not of each draw, so that draws show how they differ
     centred = {node: outline - _middle(outline) for node, outline in outlines.items()}
     clouds = {node: cloud - _middle(outlines[node]) for node, cloud in clouds.items()}
-    extents = [np.ptp(seen(part), axis=0) for part in (*centred.values(), *clouds.values())]
-    width, height = np.max(extents, axis=0) if extents else (0.0, 0.0)
-    inches = size / max(width, height) if max(width, height) > 0 else 1.0
-    width = inches * width
-    height = inches * height
+    inches, width, height = _scale([*centred.values(), *clouds.values()], size)
 
     # a tip takes the room of a shape, and of a name below it where inner nodes have one
     named = sorted(set(tree.observed) - set(tree.tips))
@@ -85,13 +81,22 @@ def tree(
     # offsets are in points, 72 to an inch
     style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 9}
     right = 72.0 * beside + 8.0 if beside else 4.0
+    names = [name or "" for name in tree.names]
     for tip in tree.tips:
-        ax.annotate(tree.names[tip] or "", (x[tip], y[tip]), (right, 0.0), va="center", **style)
+        ax.annotate(names[tip], (x[tip], y[tip]), (right, 0.0), va="center", **style)
     below = -36.0 * height - 3.0
     centre: dict[str, Any] = {"ha": "center", "va": "top"} | style
     for node in named:
-        ax.annotate(tree.names[node] or "", (x[node], y[node]), (0.0, below), **centre)
+        ax.annotate(names[node], (x[node], y[node]), (0.0, below), **centre)
     return branches
+
+
+def _scale(parts: list[NDArray], size: float) -> tuple[float, float, float]:
+    """Inches for one unit of the shapes, and the largest width and height of them in inches."""
+    extents = [np.ptp(seen(part), axis=0) for part in parts]
+    width, height = np.max(extents, axis=0) if extents else (0.0, 0.0)
+    inches = size / max(width, height) if max(width, height) > 0 else 1.0
+    return inches, inches * width, inches * height
 
 
 def _ladder(tree: Tree, x: NDArray, y: NDArray) -> NDArray:

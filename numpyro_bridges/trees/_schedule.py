@@ -72,12 +72,13 @@ def schedule(parents: Sequence[int], observed: Sequence[int]) -> Schedule:
     rounds = _rounds(_heavy_last(children, size), parents)
     order = [node for nodes in rounds for node in nodes]
     place = {node: i for i, node in enumerate(order)}
+    places = [tuple(map(place.__getitem__, nodes)) for nodes in rounds]
     slot_of, num_slots = _slots(rounds, parents, children)
     return Schedule(
         tuple(ends.tolist()),
         tuple(order),
         tuple(active.tolist()),
-        tuple(tuple(place[node] for node in nodes) for nodes in rounds),
+        tuple(places),
         num_slots,
         # `num_slots` is no place: states have none there, messages one that stays 0
         tuple(slot_of.get(node, num_slots) for node in order),
