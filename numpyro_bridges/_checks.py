@@ -197,9 +197,8 @@ def _converted(x: jax.Array | np.ndarray, dtype: Any, name: str) -> jax.Array:
     lost = np.isinf(converted) & np.isfinite(x)
     if np.any(lost):
         raise ValueError(
-            f"`{name}` must fit into {dtype}; got {x[lost][0]!s}, which would be infinite. Choose "
-            "other units, or "
-            'double precision: `jax.config.update("jax_enable_x64", True)`.'
+            f"`{name}` must fit into {dtype}; got {x[lost][0]!s}, which would be infinite. "
+            'Choose other units, or double precision: `jax.config.update("jax_enable_x64", True)`.'
         )
     with jax.ensure_compile_time_eval():  # what is known stays known while a program is traced
         return jnp.asarray(converted)

@@ -152,8 +152,7 @@ def _by_node(tree: Tree, given: Any, name: str, whole: str, single: str) -> dict
         require(
             count == tree.num_nodes,
             f"`{name}` must have the shape {whole} with {tree.num_nodes} nodes, got "
-            f"{array.shape}. Shapes of some nodes are given by name: "
-            "{name: shape}.",
+            f"{array.shape}. Shapes of some nodes are given by name: {{name: shape}}.",
         )
         numbered = {node: array[..., node, :, :] for node in range(count)}
     return {node: array for node, array in numbered.items() if len(seen(array))}

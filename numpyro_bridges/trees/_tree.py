@@ -412,11 +412,11 @@ class Tree(eqx.Module):
         near spellings, and for other numbers of rows than `observed` has, and shapes that differ.
         """
         unnamed = [node for node in self.observed if self.names[node] is None]
+        first = self._in_words(unnamed[0]) if unnamed else ""
         require(
             not unnamed,
-            "the seen nodes must have names to find their data by; "
-            f"{self._in_words(unnamed[0]) if unnamed else ''} has none. Give the tree `names`, or "
-            "arrange the rows by `tree.observed` yourself.",
+            f"the seen nodes must have names to find their data by; {first} has none. Give the "
+            "tree `names`, or arrange the rows by `tree.observed` yourself.",
         )
         seen = Counter(name for name in self.observed_names if name is not None)
         rows = _by_name(data, names, seen)
