@@ -377,7 +377,7 @@ def _rebuilt(arrays, like):
 
 def _settings_of(kernel, name) -> dict:
     """The numbers and switches of a kernel, and of its blocks."""
-    settings = {name: type(kernel).__name__}
+    settings: dict = {name: type(kernel).__name__}
     for field, value in vars(kernel).items():
         if isinstance(value, bool | int | float | str):
             settings[f"{name}.{field.lstrip('_')}"] = value
