@@ -46,6 +46,7 @@ _DTYPES: dict[Any, str | None] = {  # a time difference is an integer to NumPy: 
     jnp.integer: None,
 }
 
+# looked at before numbers are, since a boolean is an integer to Python
 _TYPES: dict[tuple[type, ...], str] = {
     (bool,): "boolean",
     (str, bytes): "text",
@@ -59,9 +60,7 @@ _short.maxstring = _short.maxother = _short.maxlong = 80
 
 
 def concrete(x: Any) -> np.ndarray | None:
-    """The value as a NumPy array, or None while a program is traced, and where other processes hold
-    a part of it.
-    """
+    """The value as a NumPy array; None where it is traced, or other processes hold a part of it."""
     return np.asarray(x) if _is_here(x) else None
 
 
@@ -72,7 +71,9 @@ def _is_here(x: Any) -> bool:
 
 def words(value: Any) -> str:
     """A value as an error shows it: on one line, an array by its type and shape."""
-    dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+    dtype = getattr(value, "dtype", None)
+    shape = getattr(value, "shape", None)
+    # a known scalar by its value; a traced one has none
     if dtype is not None and isinstance(shape, tuple) and (shape or isinstance(value, Tracer)):
         return f"an array of {dtype} of shape {shape}"
     try:
@@ -132,11 +133,13 @@ def _real(x: Any, name: str) -> jax.Array | np.ndarray:
     if kind is not None:
         _refuse(x, name, kind)
     try:
+        # NumPy cannot hold a traced number, so that a list with one becomes a traced array
         if any(isinstance(leaf, Tracer) for leaf in _leaves(x)):
             return x if isinstance(x, Tracer) else jnp.asarray(x, float)
         if isinstance(x, jax.Array):
             return x
         array = np.asarray(x)
+        # of numbers that NumPy has no type for, such as fractions and integers of 100 digits
         return array.astype(float) if array.dtype == object else array
     except OverflowError as e:
         raise ValueError(
@@ -162,6 +165,7 @@ def _leaves(x: Any):
 
 def _kind(x: Any) -> str | None:
     """What x is, if no real number and no array of them: a key of `_CURES`."""
+    # entries one by one: an array of them would have one type, and [1, True] be two numbers
     if isinstance(x, (list, tuple)):
         return next((kind for kind in map(_kind, x) if kind is not None), None)
     for types, kind in _TYPES.items():
@@ -185,6 +189,7 @@ def _kind(x: Any) -> str | None:
 
 def _converted(x: jax.Array | np.ndarray, dtype: Any, name: str) -> jax.Array:
     """x in another precision; `ValueError` for a finite number that would become infinite."""
+    # a JAX array may be traced, and has a float type; what NumPy holds is looked at
     if isinstance(x, jax.Array):
         return jnp.asarray(x, dtype)
     with np.errstate(over="ignore"):
@@ -192,9 +197,8 @@ def _converted(x: jax.Array | np.ndarray, dtype: Any, name: str) -> jax.Array:
     lost = np.isinf(converted) & np.isfinite(x)
     if np.any(lost):
         raise ValueError(
-            f"`{name}` must fit into {dtype}; got {x[lost][0]!s}, which would be infinite. Choose "
-            "other units, or "
-            'double precision: `jax.config.update("jax_enable_x64", True)`.'
+            f"`{name}` must fit into {dtype}; got {x[lost][0]!s}, which would be infinite. "
+            'Choose other units, or double precision: `jax.config.update("jax_enable_x64", True)`.'
         )
     with jax.ensure_compile_time_eval():  # what is known stays known while a program is traced
         return jnp.asarray(converted)
@@ -211,6 +215,7 @@ def positive_integer(value: Any, name: str, least: int = 1) -> int:
     kind = "a positive integer" if least == 1 else f"an integer, at least {least}"
     message = f"`{name}` must be {kind}; got {words(value)}. It is known before tracing."
     require(not isinstance(value, bool), message)
+    # not `int`, which takes 2.7 for 2, and text for a number
     try:
         size = operator.index(value)
     except TypeError as e:
@@ -250,10 +255,9 @@ def known_number(
     rule: str = "a finite number",
     ok: Callable[[float], bool] = math.isfinite,
 ) -> float:
-    """A finite setting that is known before tracing and, in the precision in use, meets a rule, in
-    words too.
-    """
+    """A finite setting, known before tracing, that meets a rule in the precision in use."""
     number = known_float(value, name)
+    # 1e-50 is positive, and 0 in single precision
     with np.errstate(over="ignore", under="ignore"):
         rounded = number.astype(jnp.result_type(float))
     require(
@@ -284,15 +288,15 @@ def as_path(value: Any, name: str) -> Path:
 
 
 def require_key(key: Any, name: str = "key", several: bool = False) -> None:
-    """One random key, `jax.random.key(0)` or the raw `jax.random.PRNGKey(0)`, or `several` in one
-    array.
-    """
+    """One random key, typed or raw (`jax.random.PRNGKey(0)`), or `several` in one array."""
     message = f"`{name}` must be a random key, such as `jax.random.key(0)`; got {words(key)}."
     require(isinstance(key, (jax.Array, np.ndarray)), message)
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     if not typed:
+        # how many words a raw key has depends on the generator that JAX is set to
         raw = jax.eval_shape(jax.random.PRNGKey, 0)
         require(key.dtype == raw.dtype and key.shape[-1:] == raw.shape, message)
+    # a raw key has an axis of words, which does not count
     require(
         key.ndim - (not typed) in ((0, 1) if several else (0,)),
         f"`{name}` must be one random key; got {words(key)}, several. Use vmap over them, or one "

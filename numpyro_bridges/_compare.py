@@ -1,6 +1,4 @@
-"""Several bridges on one estimand: the same evidence, by different guides, with what each of them
-costs.
-"""
+"""Several bridges on one estimand: one evidence by different guides, and what each costs."""
 
 import itertools
 import math
@@ -36,7 +34,7 @@ from .plot._comparison import draw_comparison
 
 _SCORE_PATHS = 64
 _JOINT_ERRORS = 3.0
-_LEAST_ESS = 100.0
+_LEAST_ESS = 100.0  # below it a standard error is itself too uncertain
 _RESOLUTION = 1.0  # nats: what agrees must not be able to differ by more
 
 
@@ -134,6 +132,7 @@ class Comparison:
         table = [header, *([name, *_cells(row)] for name, row in self.rows.items())]
         if all(math.isnan(row["score_error"]) for row in self.rows.values()):
             table = [line[:-1] for line in table]
+        # of fewer than two particles there is no threshold
         few = self.num_particles < 2
         threshold = math.nan if few else weights.pareto_k_threshold(self.num_particles)
         rule = "k̂ needs more" if few else f"k̂ must be below {threshold:.2f}"
@@ -145,20 +144,22 @@ class Comparison:
 
     def _gap(self, first: str, second: str) -> tuple[float, float, float]:
         """The distance of two log evidences, its standard error, and what rounding explains."""
-        a, b = self.rows[first], self.rows[second]
+        a = self.rows[first]
+        b = self.rows[second]
         joint = math.hypot(a["standard_error"], b["standard_error"])
         return abs(a["log_evidence"] - b["log_evidence"]), joint, a["rounding"] + b["rounding"]
 
     def _unknown(self, first: str, second: str) -> str:
         """What keeps two estimates from being compared; empty where nothing does."""
-        names = list(dict.fromkeys((first, second)))
+        names = list(dict.fromkeys((first, second)))  # once, where both are the same
         if not all(self.rows[name]["trusted"] for name in names):
             return "cannot be compared"
         _, joint, _ = self._gap(first, second)
+        # weights that are all equal, of error 0, are enough however few
         few = [
-            n
-            for n in names
-            if self.rows[n]["ess"] < _LEAST_ESS and self.rows[n]["standard_error"] > 0
+            name
+            for name in names
+            if self.rows[name]["ess"] < _LEAST_ESS and self.rows[name]["standard_error"] > 0
         ]
         if few:
             each = ", ".join(f"{self.rows[name]['ess']:.0f} of {name}" for name in few)
@@ -240,18 +241,17 @@ def compare(
         f"`training_seconds` must be of the bridges {sorted(bridges)}; got {unknown} too.",
     )
     num_particles = positive_integer(num_particles, "num_particles")
-    batch_size = (
-        min(256, num_particles)
-        if batch_size is None
-        else positive_integer(batch_size, "batch_size")
-    )
+    if batch_size is None:
+        batch_size = min(256, num_particles)
+    batch_size = positive_integer(batch_size, "batch_size")
     rows = {}
-    for (name, bridge), key_bridge in zip(
-        bridges.items(), jr.split(key, len(bridges)), strict=True
-    ):
+    # a key each: with one for all the errors of two guides would be correlated
+    keys_of_bridges = jr.split(key, len(bridges))
+    for (name, bridge), key_bridge in zip(bridges.items(), keys_of_bridges, strict=True):
         estimate, seconds = timed_estimate(bridge, key_bridge, num_particles, batch_size, mesh)
         trained = training_seconds.get(name, _trained_seconds(bridge))
         trained = known_number(trained, f"training_seconds[{name!r}]")
+        # those of the first particles of the estimate
         keys = jr.split(key_bridge, num_particles)[:_SCORE_PATHS]
         rows[name] = _row(estimate, seconds, trained)
         if score is not None:
@@ -267,10 +267,12 @@ def _check_bridges(bridges) -> None:
     )
     for name, bridge in bridges.items():
         require_instance(bridge, GuidedBridge, f"bridges[{name!r}]", "a `GuidedBridge`")
+    # all that the evidence depends on; guides alone may differ
     (first, reference), *others = bridges.items()
     for name, bridge in others:
         for field in ("sde", "condition", "x0", "ts", "solver"):
-            mine, theirs = getattr(bridge, field), getattr(reference, field)
+            mine = getattr(bridge, field)
+            theirs = getattr(reference, field)
             require(
                 eqx.tree_equal(mine, theirs),
                 f"`bridges` must have one estimand; {name!r} has another `{field}` than {first!r}"
@@ -298,6 +300,10 @@ def _row(estimate: EvidenceEstimate, seconds: float, trained: float) -> dict[str
     # one particle has an ESS of 1 and a bounded tail, both without meaning
     meant = 1.0 if num_particles > 1 else math.nan
     ess = float(estimate.ess) * meant
+
+    def per_effective_sample(seconds: float) -> float:
+        return seconds / ess if ess else math.inf
+
     return {
         "log_evidence": float(estimate.log_evidence),
         "standard_error": float(estimate.standard_error),
@@ -310,10 +316,8 @@ def _row(estimate: EvidenceEstimate, seconds: float, trained: float) -> dict[str
         "seconds": seconds,
         "training_seconds": trained,
         "score_error": math.nan,
-        "seconds_per_effective_sample": seconds / ess if ess else math.inf,
-        "seconds_per_effective_sample_with_training": (seconds + trained) / ess
-        if ess
-        else math.inf,
+        "seconds_per_effective_sample": per_effective_sample(seconds),
+        "seconds_per_effective_sample_with_training": per_effective_sample(seconds + trained),
     }
 
 
@@ -321,6 +325,7 @@ def _checked_score_error(bridge: GuidedBridge, score, keys) -> float:
     require(
         callable(score), f"`score` must be a function (t, x) of a time and a state; got {score!r}."
     )
+    # frozen as it is now: JAX would go on with what an older call of the same function has read
     score = close(score, bridge.ts[0], bridge.x0)
     require(
         score.shape == bridge.x0.shape,
@@ -332,6 +337,7 @@ def _checked_score_error(bridge: GuidedBridge, score, keys) -> float:
 @eqx.filter_jit
 @full_precision
 def _score_error(bridge: GuidedBridge, score, keys):
+    # |u|²_a of the difference and of the exact score, at one state
     def squares(t, x, s):
         s_exact = score(t, x)
         a = bridge.sde.covariance(t, x)
@@ -340,9 +346,11 @@ def _score_error(bridge: GuidedBridge, score, keys):
     def integrals(key):
         path, log_weight = bridge.path_and_log_weight(driving_noise(bridge, key))
         along = jax.vmap(squares)(bridge.ts[:-1], path[:-1], bridge.scores(path))
+        # ∫ dt by the elapsed times, which have digits that dates have lost
         return jnp.diff(bridge.grid.elapsed) @ along, log_weight
 
     found, log_weights = jax.lax.map(integrals, keys)
+    # weighted, since the expectation is over conditioned paths and these are the guide's
     error, size = jax.nn.softmax(log_weights) @ found
     return error / size
 
@@ -362,15 +370,12 @@ def _cells(row) -> list[str]:
 
 def _aligned(table: list[list[str]]) -> list[str]:
     """Lines of a table, the first column to the left and the others to the right."""
-    # a combining hat takes no room
-    hats = [[cell.count("\u0302") for cell in line] for line in table]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = []
-    for line, extra in zip(table, hats, strict=True):
-        sized = list(zip(line, np.add(widths, extra), strict=True))
-        lines.append(
-            "  ".join(
-                [sized[0][0].ljust(sized[0][1]), *(cell.rjust(width) for cell, width in sized[1:])]
-            )
-        )
+    for line in table:
+        # a combining hat takes no room
+        hats = [cell.count("\u0302") for cell in line]
+        (name, name_width), *others = zip(line, np.add(widths, hats), strict=True)
+        numbers = [cell.rjust(width) for cell, width in others]
+        lines.append("  ".join([name.ljust(name_width), *numbers]))
     return lines

@@ -1,6 +1,4 @@
-"""Small sets of shapes for examples and tests, aligned and of unit size, and the tree of one of
-them.
-"""
+"""Small sets of shapes for examples and tests, aligned and of unit size, and a tree."""
 
 import csv
 import importlib.util
@@ -16,6 +14,7 @@ from ._checks import known_float, positive_integer, words
 from .shapes import procrustes_align, resample
 from .trees import Tree
 
+# lengths by Grafen's rule: see `mosquito_tree`
 _MOSQUITO_TREE = (
     "(AN:1,(UR:0.9,((((TO:0.1,WY:0.1):0.3,(MA:0.2,(OR:0.1,CA:0.1):0.1):0.2):0.2,(CX:0.1,DE:0.1)Culicini:0.5):0.2,"
     "(PS:0.1,AE:0.1)Aedini:0.7):0.1)Culicinae:0.1);"
@@ -94,6 +93,7 @@ def mosquito_wings(num_points: int = 32, genus: str | None = None) -> Shapes:
         raise ValueError(
             f"`genus` must be one of {available}, or None for all; got {words(genus)}."
         )
+    # columns: specimen, number of the point, x, y
     specimen, _, *xy = np.loadtxt(
         folder / "data_outline_mosquito_wings.csv", delimiter=",", skiprows=1, unpack=True
     )
@@ -144,6 +144,7 @@ def ellipses(num_points: int = 32, aspects: Sequence[float] = (1.0, 1.25, 1.5, 2
         raise ValueError(
             f"`aspects` must be one or more ratios from 1e-6 to 1e6; got {words(aspects)}."
         )
+    # equal angles are not equal arc lengths: many of them, of which `resample` takes some
     angles = np.linspace(0.0, 2.0 * np.pi, 100 * num_points, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     labels = tuple(f"{aspect:g}" for aspect in ratios)
@@ -159,11 +160,11 @@ def _in_register(
 
 
 def _along_x(shapes: Shapes) -> Shapes:
-    """Turned so that the long axis of the mean is the x-axis and its first point lies at positive
-    x.
-    """
+    """Turned so that the mean's long axis is the x-axis and its first point lies at positive x."""
+    # principal axes of the mean, which is centred; their signs are arbitrary
     _, _, axes = np.linalg.svd(shapes.mean)
     axes[0] *= np.sign(shapes.mean[0] @ axes[0])
+    # the first axis and what is a quarter turn from it: a rotation, never a reflection
     turn = np.stack([axes[0], [-axes[0, 1], axes[0, 0]]], axis=1)
     return replace(shapes, points=shapes.points @ turn, mean=shapes.mean @ turn)
 

@@ -1,5 +1,6 @@
 """Preparation of shapes: equal spacing, position, size, rotation, start point, mean.
- A shape is an array (n, d) of n points in R^d, d = 2 or 3. Everything here is plain NumPy in
+
+A shape is an array (n, d) of n points in R^d, d = 2 or 3. Everything here is plain NumPy in
 float64 and runs before inference. Size is the RMS radius r(x) = (1/n Σ_i |x_i − x̄|²)^½, which does
 not grow with the number of points (the centroid size of morphometrics is √n r).
 """
@@ -51,11 +52,13 @@ def resample(points: ArrayLike, num_points: int, closed: bool = True) -> NDArray
 
     **Raises:** `ValueError` for missing (NaN) points, a curve of no length, or too few points.
     """
-    points, closed = _shape(points, "points"), flag(closed, "closed")
+    points = _shape(points, "points")
+    closed = flag(closed, "closed")
     num_points = positive_integer(num_points, "num_points", least=1 if closed else 2)
     if closed:
         points = np.concatenate([points, points[:1]])
-    arc_length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    arc_length = np.concatenate([[0.0], np.cumsum(lengths)])
     if not arc_length[-1] > 0.0:
         raise ValueError("`points` must trace a curve of positive length, got coinciding points.")
     where = np.linspace(0.0, arc_length[-1], num_points, endpoint=not closed)
@@ -157,59 +160,32 @@ def procrustes_align(
     max_iterations = positive_integer(max_iterations, "max_iterations")
     tolerance = known_number(tolerance, "tolerance", "a number from 0 on", lambda value: value >= 0)
     shapes, names = _with_names(shapes)
-    if shapes.ndim != 3 or shapes.shape[-1] not in (2, 3) or 0 in shapes.shape:
-        raise ValueError(
-            f"`shapes` must have the shape (N, n, 2) or (N, n, 3), got {shapes.shape}."
-        )
-    if np.any(np.isinf(shapes)):
-        raise ValueError(
-            "`shapes` must be finite, or NaN where a point is missing; got infinite coordinates."
-        )
-    count, num_points, dim = shapes.shape
-    names = names or (None,) * count
-    missing: NDArray = np.any(np.isnan(shapes), axis=-1)
-    num_seen = num_points - missing.sum(axis=1)
-    if num_seen.min() < dim:
-        worst = int(num_seen.argmin())
-        raise ValueError(
-            f"{_called(names, worst)} must have at least {dim} seen points, got {num_seen[worst]}: "
-            "leave it out."
-        )
-    first = None
-    if reference is None:
-        first, start = _least_incomplete(shapes, missing)
-    else:
-        start = _shape(reference, "reference")
-        if start.shape != (num_points, dim):
-            raise ValueError(
-                f"`reference` must have the shape {(num_points, dim)}, got {start.shape}."
-            )
+    missing = _missing(shapes, names)
+    first, start = _start(shapes, missing, reference)
     mirrored = _mirrored(shapes, ~missing, start, first)
     if reflect == "auto":
-        other_side = np.r_[-1.0, np.ones(dim - 1)]
+        # in the first coordinate; a rotation makes that any other plane
+        other_side = np.r_[-1.0, np.ones(shapes.shape[-1] - 1)]
         shapes = np.where(mirrored[:, None, None], shapes * other_side, shapes)
         start = start * other_side if first is not None and mirrored[first] else start
     elif mirrored.any():
-        listed = ", ".join(_called(names, i) for i in np.flatnonzero(mirrored)[:8])
-        more = f" and {mirrored.sum() - 8} more" if mirrored.sum() > 8 else ""
-        warnings.warn(
-            f"the mirror image fits far better: {listed}{more}. Seen from the other side, or y "
-            "pointing down? Leave them out, correct them, or let them be reflected by "
-            '`reflect="auto"`.',
-            stacklevel=2,
-        )
+        _warn_of_mirrored(mirrored, names)
 
     def standard(points: NDArray, name: str) -> NDArray:
         return _unit_size(center(points), name) if scale else center(points)
 
     mean = standard(start, "reference" if first is None else f"shapes[{first}]")
-    converged, iteration = False, 0
+    converged = False
+    iteration = 0
     while not converged and iteration < max_iterations:
         iteration += 1
+        # missing points anew each time: they follow the mean
         filled = standard(_fill(shapes, missing, mean), "shapes")
         aligned = filled @ _rotations(filled, mean)
-        previous, mean = mean, standard(aligned.mean(axis=0), "shapes")
+        previous = mean
+        mean = standard(aligned.mean(axis=0), "shapes")
         change = np.sqrt(np.mean(np.sum((mean - previous) ** 2, axis=-1)))
+        # onto a reference shapes are rotated once
         converged = first is None or bool(change <= tolerance * rms_radius(mean))
     if not converged:
         warnings.warn(
@@ -219,8 +195,10 @@ def procrustes_align(
             stacklevel=2,
         )
     if first is not None:
+        # all are turned back together, so that the first keeps its orientation
         back = _rotations(aligned[first], filled[first])
-        aligned, mean = aligned @ back, mean @ back
+        aligned = aligned @ back
+        mean = mean @ back
     aligned[missing] = np.nan
     squares = np.sum((aligned - mean) ** 2, axis=-1)
     distances = np.sqrt(np.nanmean(squares, axis=1)) / rms_radius(mean)
@@ -229,11 +207,56 @@ def procrustes_align(
 
 
 def _with_names(shapes: Any) -> tuple[NDArray, tuple[str | None, ...]]:
-    """An array, and the names of specimens; none of an array."""
+    """An array, and the names of specimens, `None` where there are none."""
     if isinstance(shapes, (list, tuple)) and any(isinstance(one, Specimen) for one in shapes):
         stacked = stack(shapes)
         return stacked.shapes, tuple(stacked.names)
-    return known_float(shapes, "shapes"), ()
+    array = known_float(shapes, "shapes")
+    if array.ndim != 3 or array.shape[-1] not in (2, 3) or 0 in array.shape:
+        raise ValueError(f"`shapes` must have the shape (N, n, 2) or (N, n, 3), got {array.shape}.")
+    return array, (None,) * len(array)
+
+
+def _missing(shapes: NDArray, names: tuple[str | None, ...]) -> NDArray:
+    """Which points (N, n) are missing; every shape must have enough others."""
+    if np.any(np.isinf(shapes)):
+        raise ValueError(
+            "`shapes` must be finite, or NaN where a point is missing; got infinite coordinates."
+        )
+    _, num_points, dim = shapes.shape
+    missing = np.any(np.isnan(shapes), axis=-1)
+    num_seen = num_points - missing.sum(axis=1)
+    # d points fix a rotation, which fewer do not
+    if num_seen.min() < dim:
+        worst = int(num_seen.argmin())
+        raise ValueError(
+            f"{_called(names, worst)} must have at least {dim} seen points, got {num_seen[worst]}: "
+            "leave it out."
+        )
+    return missing
+
+
+def _start(
+    shapes: NDArray, missing: NDArray, reference: ArrayLike | None
+) -> tuple[int | None, NDArray]:
+    """What the iteration begins with, and which of the shapes that is: `None` of a reference."""
+    if reference is None:
+        return _least_incomplete(shapes, missing)
+    start = _shape(reference, "reference")
+    if start.shape != shapes.shape[1:]:
+        raise ValueError(f"`reference` must have the shape {shapes.shape[1:]}, got {start.shape}.")
+    return None, start
+
+
+def _warn_of_mirrored(mirrored: NDArray, names: tuple[str | None, ...]) -> None:
+    listed = ", ".join(_called(names, i) for i in np.flatnonzero(mirrored)[:8])
+    more = f" and {mirrored.sum() - 8} more" if mirrored.sum() > 8 else ""
+    warnings.warn(
+        f"the mirror image fits far better: {listed}{more}. Seen from the other side, or y "
+        "pointing down? Leave them out, correct them, or let them be reflected by "
+        '`reflect="auto"`.',
+        stacklevel=3,
+    )
 
 
 def _called(names: tuple[str | None, ...], i: int) -> str:
@@ -254,8 +277,10 @@ def _least_incomplete(shapes: NDArray, missing: NDArray) -> tuple[int, NDArray]:
             "all. Leave these points out, or give a `reference`."
         )
     first = int(missing.sum(axis=1).argmin())
-    filled, gone = shapes[first].copy(), missing[first].copy()
+    filled = shapes[first].copy()
+    gone = missing[first].copy()
     while gone.any():
+        # how many points that are known here by now another shape shares
         common = np.sum(~gone & ~missing, axis=1)
         common[~np.any(gone & ~missing, axis=1)] = 0  # it has none of those that are sought
         other = int(common.argmax())
@@ -279,25 +304,28 @@ def _mirrored(shapes: NDArray, seen: NDArray, start: NDArray, first: int | None)
     """
     mean = start
     for _ in range(0 if first is None else _ROUNDS):
+        # U Vᵀ of the singular value decomposition, whatever its determinant: rotations and
+        # reflections
         x, onto, size, place = _in_common(shapes, seen, mean)
         u, _, vt = np.linalg.svd(np.swapaxes(x, -1, -2) @ onto)
         fitted = size * x @ (u @ vt) + place
         mean = np.nanmean(np.where(seen[..., None], fitted, np.nan), axis=0)
     x, onto, _, _ = _in_common(shapes, seen, mean)
     u, values, vt = np.linalg.svd(np.swapaxes(x, -1, -2) @ onto)
+    # Of unit sizes the cosine of the angle between shapes is the sum of the singular values; for
+    # the other hand the smallest one counts negative. √(1 − cos²) is the distance.
     best = values.sum(axis=-1)
     of_other_hand = best - 2.0 * values[:, -1]
     rotates = np.linalg.det(u @ vt) > 0.0
     cosines = np.where(rotates, best, of_other_hand), np.where(rotates, of_other_hand, best)
-    by_rotation, by_reflection = (
-        np.sqrt(1.0 - np.clip(cosine, 0.0, 1.0) ** 2) for cosine in cosines
-    )
+    by_rotation, by_reflection = (np.sqrt(1.0 - np.clip(cos, 0.0, 1.0) ** 2) for cos in cosines)
     usual = _USUAL * np.median(np.minimum(by_rotation, by_reflection))
     rotated = (_FAR * by_rotation <= by_reflection) & (by_reflection > max(usual, _SEEN))
     reflected = (_FAR * by_reflection <= by_rotation) & (by_rotation > max(usual, _SEEN))
     told = np.flatnonzero(rotated | reflected)
     if told.size < _MOST * len(shapes):
         return np.zeros(len(shapes), bool)
+    # to a reference, or to the majority; of two halves to that of the first shape that is told
     if first is None or rotated.sum() > reflected.sum():
         return reflected
     halves = rotated.sum() == reflected.sum()
@@ -326,6 +354,7 @@ def _in_common(
 
 def _far_off(distances: NDArray) -> NDArray:
     """Which distances are outliers, for their logarithms and by a robust standard deviation."""
+    # logarithms, since distances are positive and skewed
     logs = np.log(np.maximum(distances, _SEEN))
     above = logs - np.median(logs)
     spread = 1.4826 * np.median(np.abs(above))  # of a normal distribution the standard deviation
@@ -359,10 +388,12 @@ def align_start(shapes: ArrayLike, reference: ArrayLike) -> NDArray:
             f"{shapes.shape}."
         )
     n = len(reference)
+    # row k has the numbers of the points where the outline begins at its point k
     shifts = (np.arange(n)[:, None] + np.arange(n)) % n
 
     def best(shape: NDArray) -> NDArray:
         shifted = shape[shifts]
+        # of one size and centred, the nearest has the largest inner product
         fitted = center(shifted) @ _rotations(center(shifted), reference)
         return shifted[np.argmax(np.sum(fitted * reference, axis=(1, 2)))]
 
@@ -370,9 +401,9 @@ def align_start(shapes: ArrayLike, reference: ArrayLike) -> NDArray:
 
 
 def _rotations(shapes: NDArray, target: NDArray) -> NDArray:
-    """Kabsch's R (..., d, d), det R = 1, that minimise ‖x R − target‖ for centred shapes x (..., n,
-    d)."""
+    """Kabsch's R (..., d, d), det R = 1, with least ‖x R − target‖, of centred x (..., n, d)."""
     u, _, vt = np.linalg.svd(np.swapaxes(shapes, -1, -2) @ target)
+    # of the best orthogonal map, where it is a reflection, the least important axis is turned
     u[..., -1] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return u @ vt
 
@@ -382,8 +413,10 @@ def _fill(shapes: NDArray, missing: NDArray, mean: NDArray) -> NDArray:
     filled = shapes.copy()
     for shape, gone in zip(filled, missing, strict=True):
         if gone.any():
-            seen, mean_seen = center(shape[~gone]), center(mean[~gone])
+            seen = center(shape[~gone])
+            mean_seen = center(mean[~gone])
             rotation = _rotations(mean_seen, seen)
+            # the least squares of seen = size · mean_seen R
             size = np.sum((mean_seen @ rotation) * seen) / np.sum(mean_seen**2)
             offset = shape[~gone].mean(axis=0)
             shape[gone] = size * (mean[gone] - mean[~gone].mean(axis=0)) @ rotation + offset

@@ -23,12 +23,18 @@ from ..spaces import AbstractSpace
 
 @eqx.filter_jit
 def map_batch(one, shared, own, own_shape, batch_shape, arrays):
+    """`one(parts, *items)` of every item of a batch.
+
+    `own`: the parts with axes `own_shape`, `shared`: the others; `arrays`: with axes `batch_shape`.
+    """
     if not batch_shape:
         return one(shared | own, *arrays)
+    # what is no array is the same for all laws, and cannot be mapped over
     own, static = eqx.partition(own, eqx.is_array)
 
     def widened(a):
         rest = a.shape[len(own_shape) :]
+        # NumPy's broadcasting: plates stand in front of the law's own axes
         a = a.reshape((1,) * (len(batch_shape) - len(own_shape)) + a.shape)
         return flat(jnp.broadcast_to(a, batch_shape + rest))
 
@@ -38,16 +44,16 @@ def map_batch(one, shared, own, own_shape, batch_shape, arrays):
     def item(own, *items):
         return one(shared | eqx.combine(own, static), *items)
 
+    # one `vmap`, over all axes as one, whatever their number
     out = jax.vmap(item)(jax.tree.map(widened, own), *map(flat, arrays))
     return jax.tree.map(lambda a: a.reshape(batch_shape + a.shape[1:]), out)
 
 
 def one_of(parts, batched, own_shape, index):
     """The parts of one law of the batch."""
-    index = tuple(
-        i if n > 1 else 0
-        for i, n in zip(index[len(index) - len(own_shape) :], own_shape, strict=True)
-    )
+    # `index` is of the whole batch: plates in front do not count, and axes of 1 are broadcast
+    last = index[len(index) - len(own_shape) :]
+    index = tuple(i if n > 1 else 0 for i, n in zip(last, own_shape, strict=True))
 
     def pick(part):
         return jax.tree.map(lambda a: a[index] if eqx.is_array(a) else a, part)
@@ -56,9 +62,7 @@ def one_of(parts, batched, own_shape, index):
 
 
 def find_batched(parts, batch_shape, declared, check) -> tuple[str, ...]:
-    """Names of the parts that carry the batch axes: as declared, or the one reading that `check`
-    accepts.
-    """
+    """Names of the parts with batch axes: as declared, or the one reading that `check` accepts."""
     carriers = [name for name, part in parts.items() if batch_shape and _carries(part, batch_shape)]
     if declared is not None:
         for name in declared:
@@ -71,12 +75,15 @@ def find_batched(parts, batch_shape, declared, check) -> tuple[str, ...]:
             )
         readings = [tuple(declared)]
     else:
+        # every subset: a start (3, 2) in a batch (3,) is three vectors, or one state of 3 points
         readings = [
             r for k in range(len(carriers), -1, -1) for r in itertools.combinations(carriers, k)
         ]
+    # the first law of the batch stands for all: they have the same shapes
     start = (0,) * len(batch_shape)
     laws = {reading: one_of(parts, reading, batch_shape, start) for reading in readings}
     fitting = [reading for reading, law in laws.items() if len(laws) == 1 or _accepts(check, law)]
+    # where no reading fits, or the only one, the check's own error says what is wrong
     for law in [laws[r] for r in fitting] or list(laws.values()):
         _explained(check, law, batch_shape)
     require(
@@ -113,9 +120,7 @@ def _carries(part, batch_shape) -> bool:
 
 
 def stacked(part, axes, inner, own):
-    """A part whose arrays have axes of a stack in front, and then the part's own batch axes: both,
-    then `inner`.
-    """
+    """A part whose arrays have the axes of a stack, then its own batch axes: widened to `inner`."""
 
     def widened(a):
         if not eqx.is_array(a):
@@ -141,6 +146,7 @@ def parameters(part, every=False):
             if isinstance(node, AbstractSDE)
             for leaf in parameters(node, every)
         ]
+    # a space's weights and cut points are vectors always, and may be as long as a batch
     vectors = () if every else (AbstractSpace, IntervalCensored)
     leaves = jax.tree.leaves(part, is_leaf=lambda node: isinstance(node, vectors))
     return [leaf for leaf in leaves if eqx.is_inexact_array(leaf)]
@@ -162,6 +168,8 @@ def as_datum(value, name):
     """An array of floats, which stays known where a program is traced."""
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)):
         return floating(value, name)
+    # else `jnp.asarray` would make a constant of a traced function a tracer, which has no value
+    # for the checks to look at
     with jax.ensure_compile_time_eval():
         return floating(value, name)
 

@@ -48,6 +48,7 @@ class DrivingNoise(dist.Distribution):
 
     def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()):
         if key is None:
+            # NumPyro passes None where no handler seeds the site, as where draws lack the noise
             raise MissingNoise("the noise has no value, and there is no random key to draw one.")
         require_key(key)
         return jr.normal(key, self.shape(sample_shape))
@@ -73,11 +74,12 @@ class DrivingNoise(dist.Distribution):
         return DrivingNoise(batch_shape, self.event_shape)
 
     def mask(self, mask):
+        # `handlers.mask` masks every site within it, see above
         return self
 
     def to_event(self, reinterpreted_batch_ndims=None):
+        # one of its own again: NumPyro's `Independent` could be masked
         shape = self.batch_shape
-        kept = len(shape) - (
-            len(shape) if reinterpreted_batch_ndims is None else reinterpreted_batch_ndims
-        )
+        moved = len(shape) if reinterpreted_batch_ndims is None else reinterpreted_batch_ndims
+        kept = len(shape) - moved
         return DrivingNoise(shape[:kept], shape[kept:] + self.event_shape)

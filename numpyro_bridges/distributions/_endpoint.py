@@ -93,18 +93,22 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         batch_shape = as_shape(batch_shape, "batch_shape")
         batched = names_of(batched)
         parts = {"sde": sde, "x0": x0, "match": match, "guide": guide}
+        # which parts are batched comes first: all shapes below are those of one law
         names = find_batched(parts, batch_shape, batched, check_law)
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
         datum = example(one)
         exact = one["match"].at(datum).exact
+        # in double precision until differences are taken: dates are large and steps are small
         given = {"t0": t0, "t1": t1, "ts": ts}
         times = {k: value if value is None else exact_float(value, k) for k, value in given.items()}
         parts["ts"], own = _grids(times, batch_shape, num_steps=num_steps, graded=exact)
         names += ("ts",) if own else ()
+        # again, with its grid
         one = one_of(parts, names, batch_shape, (0,) * len(batch_shape))
         close_parts(parts, one, names, len(batch_shape), one["ts"].elapsed)
         noise_shape = _noise_shape(one, datum)
         declared = batched is not None
+        # a grid that is made here comes from scalars: its axis is none of data
         plain = ("ts",) if ts is None else ()
         super().__init__(
             parts, names, declared, batch_shape, datum.shape, noise_shape, validate_args, plain
@@ -112,9 +116,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
 
     @property
     def times(self):
-        """The times of a path, `(num_steps + 1,)`; with the batch axes in front where data have
-        their own.
-        """
+        """The times of a path, `(num_steps + 1,)`, behind a batch where data have their own."""
         ts = self.parts["ts"].ts
         if "ts" not in self._batched:
             return ts
@@ -139,6 +141,8 @@ class DiffusionEndpoint(AbstractNoiseDriven):
         key_path, key_seen = jr.split(key)
         path = _free_path(parts, key_path)
         seen = parts["match"].sample(key_seen, parts["sde"], path[-1])
+        # the path leaves some noise free (a pinned last step, more noises than states): a key
+        # of its own draws it
         return seen, _bridge(parts, seen).noise_from_path(path, jr.fold_in(key, 2))
 
     @staticmethod
@@ -152,6 +156,7 @@ class DiffusionEndpoint(AbstractNoiseDriven):
     @staticmethod
     def _check_data(parts, values):
         """Entries are checked one by one, so that many data are one datum with many columns."""
+        # checking a datum builds a condition: one of many columns instead of many of them
         rows = np.moveaxis(values, 0, -1)
         parts["match"].at(rows.reshape(len(rows), -1) if len(values) > 1 else values[0])
 
@@ -169,9 +174,11 @@ def names_of(batched) -> tuple[str, ...] | None:
 
 def _grids(times, batch_shape, **settings):
     """The time grid, or one for each law of a batch, and whether it is one each."""
-    own, shared = {}, {}
+    own = {}
+    shared = {}
     for name, value in times.items():
         shape = () if value is None else np.shape(value)
+        # a grid has its own axis of times, the last
         inner = shape[len(shape) - 1 :] if name == "ts" else ()
         batch = shape[: len(shape) - len(inner)]
         require(
@@ -187,6 +194,7 @@ def _grids(times, batch_shape, **settings):
     def grid(own):
         return time_grid(**shared, **own, **settings)
 
+    # traced times go through `vmap`; known ones one by one, so that an error names its law
     if any(concrete(value) is None for value in own.values()):
         one = grid
         for _ in batch_shape:
@@ -209,11 +217,10 @@ def _bridge(parts, value) -> GuidedBridge:
 
 
 def close_parts(parts, one, names, num_axes, ts, several=()) -> None:
-    """Freezes what users' functions read, for one law and for the batch; `several`: parts of which
-    a law has many.
-    """
+    """Freezes what users' functions read; `several`: parts of which one law has many."""
 
     def set_closed(name, close):
+        # traced at the shapes of one law; arrays of the batch are mapped over
         one[name] = close(one[name])
         for _ in range((num_axes if name in names else 0) + (name in several)):
             close = eqx.filter_vmap(close)
@@ -240,7 +247,9 @@ def _path(parts, value, noise):
 
 
 def _free_path(parts, key):
-    sde, x0, grid = parts["sde"], parts["x0"], parts["ts"]
+    sde = parts["sde"]
+    x0 = parts["x0"]
+    grid = parts["ts"]
     shape = (grid.num_steps, sde.noise_size(x0), x0.shape[1] if x0.ndim == 2 else 1)
     return simulate(sde, x0, grid, jr.normal(key, shape, x0.dtype))
 
@@ -248,6 +257,7 @@ def _free_path(parts, key):
 def example(parts) -> Array:
     """A datum for what is known before there is one: zeros, where a match may be made at them."""
     match = parts["match"]
+    # a density of the user's may not be defined at 0
     if isinstance(match, AbstractDensityMatch):
         return match.example(parts["sde"], parts["x0"])
     return jnp.zeros(seen_shape(parts))

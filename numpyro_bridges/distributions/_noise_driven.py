@@ -1,6 +1,4 @@
-"""A NumPyro distribution of an observation whose density is that of a bridge, given standard normal
-noise.
-"""
+"""A NumPyro distribution of an observation: its density, given the noise, is a bridge's."""
 
 import copy
 import math
@@ -33,6 +31,8 @@ class AbstractNoiseDriven(dist.Distribution):
     arg_constraints = {}
     pytree_data_fields = ("parts", "noise", "_mask", "_stack")
     pytree_aux_fields = ("_batched", "_declared", "_plain", "_own_shape", "_noise_shape", "_moved")
+    # The law of which `_as_batch` made a batch. It is flattened in the place of the batch: what a
+    # `vmap` over the batch unflattens is then single laws again.
     _single = None
 
     def __init__(
@@ -46,18 +46,23 @@ class AbstractNoiseDriven(dist.Distribution):
         validate_args=None,
         plain=(),
     ):
-        self.parts, self.noise, self._mask = parts, None, None
-        # gets the axes that a transformation puts in front of all arrays
+        self.parts = parts
+        self.noise = None
+        self._mask = None
+        # A probe of shape (): `jax.vmap` and `lax.scan` put their axes in front of all arrays of
+        # what they return, and by the probe they are known from those of the parts.
         self._stack = np.zeros(())
-        self._batched, self._declared = batched, declared
+        self._batched = batched
+        self._declared = declared
         # parts made of scalars, which no parameter of a datum can have broadcast
         self._plain = plain
-        self._own_shape, self._noise_shape, self._moved = batch_shape, noise_shape, 0
+        self._own_shape = batch_shape
+        self._noise_shape = noise_shape
+        self._moved = 0
         super().__init__(batch_shape, event_shape, validate_args=validate_args)
         self.refuse_hidden_axes(batch_shape, names=("sde", "match"))
 
     def tree_flatten(self):
-        # a stack is taken apart again as the single law that it was made of
         return super().tree_flatten() if self._single is None else self._single.tree_flatten()
 
     @classmethod
@@ -70,11 +75,13 @@ class AbstractNoiseDriven(dist.Distribution):
     def _as_batch(self, axes):
         """The batch of laws whose arrays all have the axes of a stack in front."""
         inner = (1,) * (len(self._full_shape) - len(self._own_shape)) + self._own_shape
+        parts = {}
+        for name, part in self.parts.items():
+            own = self._own_shape if name in self._batched else ()
+            parts[name] = stacked(part, axes, inner, own)
+        # every part has the stack's axes, so that every part is batched now
         law = self._replace(
-            parts={
-                name: stacked(part, axes, inner, self._own_shape if name in self._batched else ())
-                for name, part in self.parts.items()
-            },
+            parts=parts,
             _batched=tuple(self.parts),
             _own_shape=axes + inner,
             _batch_shape=axes + self.batch_shape,
@@ -111,16 +118,12 @@ class AbstractNoiseDriven(dist.Distribution):
 
     @staticmethod
     def _check_data(parts, values):
-        """`ValueError` if one of the values, a leading axis of them, cannot be observed, by its
-        match alone.
-        """
+        """`ValueError` if one of the values (a leading axis) cannot be observed by the match."""
         raise NotImplementedError
 
     @property
     def has_rsample(self):
-        """`False`: what asks for it is a variational guide, and a law whose density needs the noise
-        cannot be one.
-        """
+        """`False`: variational guides ask, and a law whose density needs noise cannot be one."""
         return False
 
     @property
@@ -154,16 +157,13 @@ class AbstractNoiseDriven(dist.Distribution):
             f"{noise.shape[:k]}. Draw it from `law.noise_prior()`, inside the same plates as the "
             "data.",
         )
-        return (
-            self._replace(noise=None)
-            ._widened(noise.shape[: noise.ndim - len(self._noise_shape)])
-            ._replace(noise=noise)
-        )
+        # without the old noise, which need not be as many as the new one
+        free = self._replace(noise=None)
+        wide = free._widened(noise.shape[: noise.ndim - len(self._noise_shape)])
+        return wide._replace(noise=noise)
 
     def sample(self, key, sample_shape=()):
-        """Observations of the unconditioned process. The bound noise, which belongs to a datum,
-        plays no part.
-        """
+        """Observations of the unconditioned process. Bound noise, of a datum, plays no part."""
         return self._over_batch(self._observe, *self._keys(key, sample_shape))
 
     def sample_with_noise(self, key, sample_shape=()):
@@ -184,9 +184,7 @@ class AbstractNoiseDriven(dist.Distribution):
         return self._log_prob_by(self._log_weight, (), value)
 
     def _log_prob_by_block(self, value):
-        """Terms of `log_prob`, an axis of `noise_blocks` behind those of the batch; their sum is
-        `log_prob`.
-        """
+        """Terms that add up to `log_prob`, an axis of `noise_blocks` behind those of the batch."""
         blocks = self.noise_blocks
         assert blocks is not None
         return self._log_prob_by(self._log_weights, (len(blocks.above),), value)
@@ -201,16 +199,22 @@ class AbstractNoiseDriven(dist.Distribution):
             "bound. Use `numpyro_bridges.sample(name, law, obs=...)`, the handler `NoiseReparam`, "
             "or `law.given(noise)`.",
         )
-        full, mask = self._full_shape, self._mask
-        if mask is not None and not np.any(concrete(mask) if concrete(mask) is not None else True):
+        full = self._full_shape
+        mask = self._mask
+        known_mask = None if mask is None else concrete(mask)
+        # nothing counts: no bridge need be computed
+        if known_mask is not None and not np.any(known_mask):
             return jnp.zeros(self.batch_shape + inner)
         value = jnp.broadcast_to(value, self.shape())
+        # The value is replaced before, and the result after. A `where` after alone would leave the
+        # derivative NaN where a hidden value is NaN: 0 · NaN.
         if mask is not None:
             hidden = ~mask.reshape(mask.shape + (1,) * (value.ndim - mask.ndim))
             value = jnp.where(hidden, self._over_batch(self._placeholder, full, value), value)
         log_prob: Array = self._over_batch(log_weight, full, value, self.noise)
         if mask is not None:
             log_prob = jnp.where(mask.reshape(mask.shape + (1,) * len(inner)), log_prob, 0.0)
+        # axes that `to_event` has moved are one datum, of independent ones
         last = len(self.batch_shape)
         return jnp.sum(log_prob, axis=tuple(range(last, last + self._moved)))
 
@@ -223,15 +227,14 @@ class AbstractNoiseDriven(dist.Distribution):
         path = self._over_batch(one, self._full_shape, observed, self.noise)
         if self._mask is None:
             return path
-        return jnp.where(
-            self._mask.reshape(self._full_shape + (1,) * (path.ndim - self._mask.ndim)),
-            path,
-            jnp.nan,
-        )
+        mask = self._mask.reshape(self._full_shape + (1,) * (path.ndim - self._mask.ndim))
+        return jnp.where(mask, path, jnp.nan)
 
     def expand(self, batch_shape):
         return self._widened(as_shape(batch_shape, "batch_shape") + self.event_shape[: self._moved])
 
+    # `expand`, `mask` and `to_event` return a law like this one: NumPyro's wrappers would hide
+    # `given`, and a site could not bind its noise
     def mask(self, mask):
         if mask is True:
             return self
@@ -243,6 +246,7 @@ class AbstractNoiseDriven(dist.Distribution):
         mask = jnp.asarray(known)
         law = self.expand(jnp.broadcast_shapes(mask.shape, self.batch_shape))
         mask = jnp.broadcast_to(mask, law.batch_shape)
+        # a mask is of data as they are now: of all that `to_event` has moved into one
         mask = jnp.broadcast_to(mask.reshape(mask.shape + (1,) * law._moved), law._full_shape)
         return law._replace(_mask=mask if law._mask is None else mask & law._mask)
 
@@ -255,7 +259,8 @@ class AbstractNoiseDriven(dist.Distribution):
             f"`reinterpreted_batch_ndims` must be a number from 0 to {n}, the number of batch "
             f"axes; got {words(k)}.",
         )
-        batch, moved = self.batch_shape[: n - k], self.batch_shape[n - k :]
+        batch = self.batch_shape[: n - k]
+        moved = self.batch_shape[n - k :]
         return self._replace(
             _batch_shape=batch, _event_shape=moved + self.event_shape, _moved=self._moved + k
         )
@@ -278,7 +283,8 @@ class AbstractNoiseDriven(dist.Distribution):
             return self
         require(broadcasts(old, full), f"a law of batch shape {old} cannot be expanded to {full}.")
         self.refuse_hidden_axes(full, names=("sde", "match"))
-        noise, mask = self.noise, self._mask
+        noise = self.noise
+        mask = self._mask
         if noise is not None:
             require(
                 math.prod(old) == math.prod(full),
@@ -337,7 +343,9 @@ class AbstractNoiseDriven(dist.Distribution):
             f"law of batch {self.batch_shape}. One noise shared by several data is a wrong "
             "likelihood: put the site into a `numpyro.plate`.",
         )
-        data, mask = concrete(value), True if self._mask is None else concrete(self._mask)
+        # traced values cannot be looked at
+        data = concrete(value)
+        mask = True if self._mask is None else concrete(self._mask)
         if data is not None and mask is not None:
             full = shape[: k + self._moved] if mask is True else self._full_shape
             data = np.broadcast_to(data, full + self.event_shape[self._moved :])
@@ -345,14 +353,14 @@ class AbstractNoiseDriven(dist.Distribution):
                 self._check_seen(data, np.broadcast_to(mask, full))
 
     def _check_seen(self, data, seen):
-        """All data at once; one after the other to name the one that is wrong, or where each has
-        its own match.
-        """
+        """All data at once; one by one to name a wrong one, or where each has its own match."""
         batched = tuple({"match"} & set(self._batched))
         match = {name: self.parts[name] for name in ("match", "settings") if name in self.parts}
+        # thousands of data in one check; only where it fails they are taken one by one
         if not seen.any() or not batched and _passes(self._check_data, match, data[seen]):
             return
         for index in map(tuple, np.argwhere(seen)):
+            # the place in the law's own batch, behind plates
             own = index[max(len(index) - len(self._own_shape), 0) :]
             own = (0,) * (len(self._own_shape) - len(own)) + own
             try:
@@ -361,6 +369,7 @@ class AbstractNoiseDriven(dist.Distribution):
                 raise ValueError(f"datum {tuple(map(int, index))}: {e}" if index else str(e)) from e
 
     def _validate_sample(self, value):
+        # NumPyro warns of values outside of the support; ours are refused
         self._check_value(value, "value")
         return jnp.ones((), bool)
 

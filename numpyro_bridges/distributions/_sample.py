@@ -1,6 +1,4 @@
-"""Sites with driving noise: a primitive, and a reparametrisation handler that does the same for
-`numpyro.sample`.
-"""
+"""Sites with driving noise: a primitive, and a handler that does the same for `numpyro.sample`."""
 
 import numpyro
 from numpyro import handlers
@@ -59,10 +57,12 @@ def _with_noise(name, law, obs):
         "`law.to_event`, which keep the noise.",
     )
     site = f"{name}_noise"
-    mark = {"driving_noise": True} | (
-        {} if law.noise_blocks is None else {"blocks": law.noise_blocks}
-    )
+    # how kernels of MCMC find the noise among the sites, and the branches within it
+    mark: dict = {"driving_noise": True}
+    if law.noise_blocks is not None:
+        mark["blocks"] = law.noise_blocks
     try:
+        # a trace of its own, since plates are known to a site only after it is sampled
         with handlers.trace() as own:
             noise = numpyro.sample(site, law.noise_prior(), infer=mark)
     except MissingNoise as e:
@@ -73,6 +73,7 @@ def _with_noise(name, law, obs):
             "`numpyro_bridges.estimate_evidence` of each datum's bridge."
         ) from e
     plates = next(iter(own.values()))["cond_indep_stack"]
+    # enumeration puts axes to the left of all plates: a law that has some depends on such a site
     outermost = max((-plate.dim for plate in plates), default=0)
     require(
         len(law.batch_shape) <= outermost or not any(map(_enumerates, _PYRO_STACK)),
@@ -82,6 +83,7 @@ def _with_noise(name, law, obs):
         "from one `law.noise_prior()`, or draw the class in a block of `Gibbs`.",
     )
     law = law.given(noise)
+    # noise from `posterior_samples` has the size of the data that it was drawn with
     for plate in plates:
         size = law.batch_shape[plate.dim] if len(law.batch_shape) >= -plate.dim else 1
         require(
@@ -90,6 +92,8 @@ def _with_noise(name, law, obs):
             f"{plate.size}: noise belongs to the data that were seen. For new data leave it out "
             "of the draws that `Predictive` is given.",
         )
+    # A parameter that is drawn inside the plate has its axis, and would silently be broadcast
+    # into the state of every datum.
     drawn, sizes = _drawn_inside(plates)
     law.refuse_hidden_axes(sizes, drawn)
     if obs is not None:
@@ -113,7 +117,9 @@ def _enumerates(handler) -> bool:
 
 def _drawn_inside(plates) -> tuple[str, tuple[int, ...]]:
     """A site that is drawn inside some of these plates, and the sizes of those plates."""
-    drawn, sizes = "", set()
+    drawn = ""
+    sizes = set()
+    # a `trace` further out knows the sites before this one; every kernel has one
     for handler in _PYRO_STACK:
         for name, site in handler.trace.items() if isinstance(handler, handlers.trace) else ():
             noise = site["type"] == "sample" and isinstance(

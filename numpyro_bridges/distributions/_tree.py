@@ -52,9 +52,9 @@ class _Settings(eqx.Module):
 
     @property
     def steps_together(self) -> int:
-        """Steps that every branch has, or every piece of it: a branch with more is a chain of
-        branches.
-        """
+        """Steps of every piece; a branch with more of them is a chain of pieces."""
+        # a branch is an entry of arrays (branches, steps): the greatest common divisor of all
+        # numbers of steps is the longest piece of which every branch is a whole number
         return int(np.gcd.reduce(self.num_steps))
 
     @property
@@ -146,10 +146,11 @@ class DiffusionTree(AbstractNoiseDriven):
             any(tree.observed),
             "`tree` must have a seen node besides its root, which no branch leads to.",
         )
-        prior = (
-            None if root_covariance is None else as_covariance(root_covariance, "root_covariance")
-        )
-        own, own_edges = names_of(per_row) or (), names_of(per_edge) or ()
+        prior = None
+        if root_covariance is not None:
+            prior = as_covariance(root_covariance, "root_covariance")
+        own = names_of(per_row) or ()
+        own_edges = names_of(per_edge) or ()
         require(set(own) <= {"match"}, f"`per_row` may hold 'match'; got {per_row}.")
         require(set(own_edges) <= {"sde"}, f"`per_edge` may hold 'sde'; got {per_edge}.")
         require(
@@ -169,12 +170,14 @@ class DiffusionTree(AbstractNoiseDriven):
             "tree": tree,
             "t0": start,
             "settings": settings,
+            "root_covariance": prior,
         }
-        parts["root_covariance"] = prior
         names = find_batched(parts, batch_shape, declared, _check)
+        # the law of one node and one branch: what is the same on all of them is found by it
         one = _simplest(one_of(parts, names, batch_shape, (0,) * len(batch_shape)))
         datum = _examples(one)
         _check_condition(one, datum)
+        # of any length: users' functions are traced on it, and only its shape counts
         ts = jnp.linspace(0.0, 1.0, settings.steps_together + 1)
         close_parts(parts, one, names, len(batch_shape), ts, own + own_edges)
         num_steps_in_all = sum(settings.num_steps[node - 1] for node in tree.active)
@@ -200,12 +203,15 @@ class DiffusionTree(AbstractNoiseDriven):
     @property
     def noise_blocks(self) -> NoiseBlocks:
         """The root, where it has a prior, and the branches that have noise, in preorder."""
-        tree, num_steps = self.tree, self.parts["settings"].num_steps
+        tree = self.tree
+        num_steps = self.parts["settings"].num_steps
         branches = tree.active
         sizes = tuple(num_steps[node - 1] for node in branches)
+        # rows in front of those of the branches, if any
         root = self._noise_shape[0] - sum(sizes)
         nodes = (0, *branches) if root else branches
         number = {node: i for i, node in enumerate(nodes)}
+        # a branch at the root has the root's block above it, or none
         above = tuple(number.get(tree.parents[node], -1) for node in nodes)
         return NoiseBlocks((root, *sizes) if root else sizes, above)
 
@@ -266,6 +272,7 @@ class DiffusionTree(AbstractNoiseDriven):
     @staticmethod
     def _simulate(parts, key):
         seen, paths = _simulated(parts, key)
+        # `_simulated` has split the key: folding in another number gives a third one
         noise = _problem(parts, seen).noise_from_paths(paths, jr.fold_in(key, 2))
         columns = parts["x0"].shape[1] if parts["x0"].ndim == 2 else 1
         return seen, noise.reshape(len(noise), -1, columns)
@@ -276,8 +283,10 @@ class DiffusionTree(AbstractNoiseDriven):
 
     @staticmethod
     def _log_weights(parts, value, noise):
+        # the sweep has a term for each piece of a branch: blocks are whole branches
         terms = _problem(parts, value).log_weights(_driving(parts, noise))
-        tree, pieces = parts["tree"], parts["settings"].pieces
+        tree = parts["tree"]
+        pieces = parts["settings"].pieces
         active = np.array(tree.active)
         branch = np.repeat(np.arange(len(active)), pieces[active - 1])
         root = len(terms) - len(branch)  # 1 where it has a prior
@@ -286,6 +295,7 @@ class DiffusionTree(AbstractNoiseDriven):
 
     @staticmethod
     def _placeholder(parts, value):
+        # data that the law itself could have drawn, so that no weight is extreme
         return _simulated(parts, jr.key(0))[0].astype(value.dtype)
 
     @staticmethod
@@ -325,7 +335,8 @@ def _first(part):
 
 def _check(parts):
     """Raises unless the parts make one law."""
-    tree, settings = parts["tree"], parts["settings"]
+    tree = parts["tree"]
+    settings = parts["settings"]
     for name in settings.per_row:
         _check_axis(parts[name], len(tree.observed), f"`{name}` is in `per_row`", "row of data")
     for name in settings.per_edge:
@@ -336,7 +347,8 @@ def _check(parts):
                 f"`{name}` must have one space on all branches.",
             )
     check_law(_simplest(parts))
-    prior, n = parts["root_covariance"], parts["x0"].shape[0]
+    prior = parts["root_covariance"]
+    n = parts["x0"].shape[0]
     require(
         prior is None or prior.ndim == 0 or prior.shape[0] == n,
         f"`root_covariance` must be a number, ({n},) or ({n}, {n}), as the state has {n} rows; got "
@@ -356,7 +368,10 @@ def _check_axis(part, size, why, what):
 
 
 def _check_condition(parts, datum):
-    tree, condition = parts["tree"], parts["match"].at(datum[0])
+    tree = parts["tree"]
+    condition = parts["match"].at(datum[0])
+    # a set draws its target before the first step, when the state at the branch's start is known;
+    # the sweep needs the target on its way up
     require(
         condition.num_extra_noises == 0 or condition.is_approximated,
         "`match` must see a value at each node, such as `InexactMatch(variance)`: branches are not "
@@ -370,6 +385,7 @@ def _check_condition(parts, datum):
         f"`match` must have a Gaussian error where nodes have several rows, and {twice} rows are "
         "of nodes that have one already: use an `InexactMatch`, of the variance within species.",
     )
+    # a pinned inner node would need the last step of its branch to be that of an end
     inner = [node for node in tree.observed if node not in tree.tips]
     require(
         not (condition.exact and inner),
@@ -384,24 +400,32 @@ def _problem(parts, value) -> TreeProblem:
 
 
 def _unled(parts, value) -> TreeProblem:
-    match, x0, tree, settings = parts["match"], parts["x0"], _divided(parts), parts["settings"]
-    sde, sdes = parts["sde"], None
+    match = parts["match"]
+    x0 = parts["x0"]
+    tree = _divided(parts)
+    settings = parts["settings"]
+    sde = parts["sde"]
+    sdes = None
     if "sde" in settings.per_edge:
+        # a piece has the SDE of its branch
         pieces = settings.pieces
         branch = np.repeat(np.arange(len(pieces)), pieces)
-        sde, sdes = _first(sde), jax.tree.map(lambda a: a[branch] if eqx.is_array(a) else a, sde)
+        sdes = jax.tree.map(lambda a: a[branch] if eqx.is_array(a) else a, sde)
+        sde = _first(sde)
     own = "match" in settings.per_row
+    # `observed` is sorted, so that the rows of a node are neighbours
     sizes = tuple(Counter(tree.observed).values())
     if max(sizes) > 1:
         conditions = fused(match, value, sizes, own, sde, x0)
     else:
-        conditions = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))(
-            match, value
-        )
+        at = jax.vmap(lambda match, v: match.at(v), in_axes=(0 if own else None, 0))
+        conditions = at(match, value)
     if conditions.is_approximated:
         conditions = _anchored(parts, sde, tree, conditions)
-    guide, root = parts["guide"], _root(parts)
+    guide = parts["guide"]
+    root = _root(parts)
     if _is_flat(parts):
+        # the guide is that of the SDE itself: of the flattened one the default might be another
         guide = default_guide(sde, x0) if guide is None else guide
         dim = x0.shape[1]
         sde, sdes = (s if s is None else Flattened(s, dim) for s in (sde, sdes))
@@ -412,25 +436,27 @@ def _unled(parts, value) -> TreeProblem:
 
 
 def _anchored(parts, sde: AbstractSDE, tree: Tree, conditions):
-    """Conditions with the observations that paths are led by: near where a Brownian motion would be
-    at each node.
-    """
-    x0, prior = parts["x0"], parts["root_covariance"]
+    """Conditions approximated near where a Brownian motion would be at each node, to lead paths."""
+    x0 = parts["x0"]
+    prior = parts["root_covariance"]
     n = x0.shape[0]
+    # of x after a time t since the root: mean x0, covariance C + t a(x0)
     a = promote(sde.covariance(parts["t0"], x0), 2, n)
-    at_root = (
-        jnp.zeros_like(a) if prior is None else promote(symmetric(prior).astype(x0.dtype), 2, n)
-    )
+    at_root = jnp.zeros_like(a)
+    if prior is not None:
+        at_root = promote(symmetric(prior).astype(x0.dtype), 2, n)
 
     def anchored(condition, depth):
         return condition.anchored(sde, lambda: (x0, at_root + depth * a))
 
+    # each node once, as the conditions are
     nodes = np.array(list(dict.fromkeys(tree.observed)))
     return jax.vmap(anchored)(conditions, tree.depths[nodes])
 
 
 def _is_flat(parts) -> bool:
     """Whether what is computed has states that are those of the law, flattened."""
+    # a user's density couples the columns of a state, which a map on the first axis cannot hold
     return isinstance(parts["match"], AbstractDensityMatch) and parts["x0"].ndim == 2
 
 
@@ -446,16 +472,18 @@ def _divided(parts) -> Tree:
 
 
 def _along(parts, by_piece):
-    """What is known at the states of all pieces, `(pieces, steps together + 1, ...)`, for each
-    branch as a whole.
-    """
-    settings, active = parts["settings"], np.array(parts["tree"].active)
+    """From `(pieces, steps together + 1, ...)`, at the states of pieces, to whole branches."""
+    settings = parts["settings"]
+    active = np.array(parts["tree"].active)
     together = settings.steps_together
-    counts, pieces = np.array(settings.num_steps)[active - 1], settings.pieces[active - 1]
+    counts = np.array(settings.num_steps)[active - 1]
+    pieces = settings.pieces[active - 1]
     first = np.cumsum(pieces) - pieces
+    # the last state of a piece is the first of the next: of both it is taken once
     state = np.arange(max(counts) + 1)
     piece = np.maximum(state - 1, 0) // together  # that it is in or at the end of
     inside = state <= counts[:, None]
+    # behind a branch's end any entry will do, and is NaN in the end
     found = by_piece[np.where(inside, first[:, None] + piece, 0), state - together * piece]
     return jnp.where(inside.reshape(inside.shape + (1,) * (found.ndim - 2)), found, jnp.nan)
 
@@ -492,18 +520,25 @@ def _paths(parts, value, noise):
 
 def _nodes(parts, value, noise):
     problem = _problem(parts, value)
-    states = _unflat(parts, problem.at_nodes(problem.paths(_driving(parts, noise))))
+    paths = problem.paths(_driving(parts, noise))
+    states = _unflat(parts, problem.at_nodes(paths))
+    # of the nodes of the divided tree those that the tree has
     return states[np.concatenate([[0], np.cumsum(parts["settings"].pieces)])]
 
 
 def _simulated(parts, key):
     """What is seen, and the paths of the branches that lead to it."""
     key_path, key_seen = jr.split(key)
-    tree, match, own = _divided(parts), parts["match"], parts["settings"].per_row
+    tree = _divided(parts)
+    match = parts["match"]
+    own = parts["settings"].per_row
+    # in the problem's states, which may be flattened, so that paths can be led back by it
     problem = _without_data(parts)
-    sde, x0 = problem.sde, problem.x0
+    sde = problem.sde
+    x0 = problem.x0
     shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])
     paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))
+    # one state for each row: rows of one node have the same, and errors of their own
     ends = _unflat(parts, problem.at_nodes(paths)[np.array(tree.observed)])
     sde = parts["sde"] if "sde" not in parts["settings"].per_edge else _first(parts["sde"])
     keys = jr.split(key_seen, len(ends))

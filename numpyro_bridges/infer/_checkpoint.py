@@ -104,6 +104,8 @@ def run_checkpointed(
         "num_chains=8)`.",
     )
     mesh_for(mcmc.num_chains, "`num_chains` of `mcmc`", mesh)
+    # The chains are started anew even where a run goes on: the start says what a state looks like,
+    # and whether model and data are those of the run on disk.
     chains = _Chains(
         mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh
     )
@@ -119,9 +121,11 @@ def run_checkpointed(
     try:
         with tqdm(total=total, initial=done, disable=not mcmc.progress_bar) as bar:
             while done < total:
+                # the next multiple of the interval: a run that was made longer may begin within one
                 stop = min((done // interval + 1) * interval, total)
                 state, draws = chains.advance(state, done, stop)
                 if is_writer(chains.mesh):
+                    # draws first: the state commits them
                     if draws:
                         _write(_draws_file(folder, done), draws)
                     _write(folder / "state.npz", chains.record(state, stop))
@@ -135,6 +139,7 @@ def run_checkpointed(
                     count = f"{divergences} divergences" if "diverging" in chains.fields else ""
                     bar.set_postfix_str(", ".join(filter(None, (chains.diagnostics(state), count))))
     except KeyboardInterrupt:
+        # from the files, since the interrupt may have come between the two of an interval
         state, done = _load_state(folder, chains)
         _hand_over(folder, chains, state, done)
         print(
@@ -144,6 +149,7 @@ def run_checkpointed(
             file=sys.stderr,
         )
         raise
+    # the other processes read what the first one has written
     wait_for_all(chains.mesh, "the draws are written")
     _hand_over(folder, chains, state, done)
 
@@ -154,63 +160,84 @@ class _Chains:
     def __init__(
         self, mcmc, rng_key, args, kwargs, init_params, extra_fields, keep_noise, interval, mesh
     ):
-        self.mcmc, self.args, self.kwargs, self.interval = mcmc, args, kwargs, interval
+        self.mcmc = mcmc
+        self.args = args
+        self.kwargs = kwargs
+        self.interval = interval
         self.sampler = copy.copy(mcmc.sampler)  # `init` leaves functions in it
+        # as `MCMC` reads them: "z", or "~z.site" for a site that is not kept
         names = dict.fromkeys([mcmc._sample_field, *mcmc._default_fields, *extra_fields])
+        dropped = [name for name in names if name.startswith("~")]
         self.fields = [name for name in names if not name.startswith("~")]
-        self.removed = {
-            name.removeprefix(f"~{mcmc._sample_field}.") for name in names if name.startswith("~")
-        }
+        self.removed = {name.removeprefix(f"~{mcmc._sample_field}.") for name in dropped}
         self.noise = () if keep_noise == 1 else _noise_of(self.sampler, args, kwargs)
         self.keep_noise = keep_noise
         self.batched = mcmc.num_chains > 1 and mcmc.chain_method == "vectorized" and mesh is None
         self.mesh = mesh or getattr(mcmc.sampler, "_mesh", None)
 
-        keys = (
-            jr.split(rng_key, mcmc.num_chains)
-            if mcmc.num_chains > 1 and is_prng_key(rng_key)
-            else rng_key
-        )
-        init = _over_chains(
-            mcmc, mesh, lambda x, _: self.sampler.init(x[0], mcmc.num_warmup, x[1], args, kwargs)
-        )
-        start = jax.tree.map(_array, init((keys, jax.tree.map(jnp.asarray, init_params)), ()))
-        self.start = _rebuilt(_named(gather(_plain(start))), start)
+        self.start = self._started(rng_key, init_params, mesh)
         for name in self.fields:
             _require_field(self._first(self.start), name)
+        # one number for each array, that another model or other data would change
         leaves = jax.tree.leaves(_plain(self.start))
         self.fingerprint = np.array([np.sum(np.abs(x), dtype=float) for x in leaves])
-        self.draw = jax.eval_shape(
-            self._collect, self.start if self.batched else self._first(self.start)
-        )
+        one = self.start if self.batched else self._first(self.start)
+        self.draw = jax.eval_shape(self._collect, one)
         self._program = _over_chains(mcmc, mesh, self._advance, jax.jit)
 
-        method = "mesh" if mesh else getattr(mcmc.chain_method, "__name__", mcmc.chain_method)
         inputs = {"rng_key": rng_key, "args": args, "kwargs": kwargs, "init_params": init_params}
-        shapes = _named({"draw": self.draw, "state": self.start})
         self.settings = {
+            **self._settings_of_run(mesh),
+            "extra_fields": sorted(extra_fields),
+            **_settings_of(self.sampler, "kernel"),
+            **{name: _described(value) for name, value in _named(inputs).items()},
+            **self._shapes(),
+        }
+
+    def _started(self, rng_key, init_params, mesh):
+        """The states of the chains before the first iteration, on the host."""
+        mcmc = self.mcmc
+        keys = rng_key
+        if mcmc.num_chains > 1 and is_prng_key(rng_key):  # and not one for each chain
+            keys = jr.split(rng_key, mcmc.num_chains)
+
+        def init(x, _):
+            key, params = x
+            return self.sampler.init(key, mcmc.num_warmup, params, self.args, self.kwargs)
+
+        inputs = keys, jax.tree.map(jnp.asarray, init_params)
+        start = jax.tree.map(_array, _over_chains(mcmc, mesh, init)(inputs, ()))
+        # to the host and back, as a state that is read from a file: both start alike
+        return _rebuilt(_named(gather(_plain(start))), start)
+
+    def _settings_of_run(self, mesh) -> dict:
+        mcmc = self.mcmc
+        method = "mesh" if mesh else getattr(mcmc.chain_method, "__name__", mcmc.chain_method)
+        # without `num_samples`, which may grow
+        return {
             "num_warmup": mcmc.num_warmup,
             "num_chains": mcmc.num_chains,
             "chain_method": method if mcmc.num_chains > 1 else None,
             "thinning": mcmc.thinning,
-            "interval": interval,
-            "keep_noise": keep_noise,
-            "extra_fields": sorted(extra_fields),
-            **_settings_of(self.sampler, "kernel"),
-            **{name: _described(value) for name, value in _named(inputs).items()},
-            **{f"the shape of {name}": f"{x.dtype}{list(x.shape)}" for name, x in shapes.items()},
+            "interval": self.interval,
+            "keep_noise": self.keep_noise,
         }
 
+    def _shapes(self) -> dict:
+        """Types and shapes of a draw and of the states, which the model decides."""
+        shapes = _named({"draw": self.draw, "state": self.start})
+        return {f"the shape of {name}": f"{x.dtype}{list(x.shape)}" for name, x in shapes.items()}
+
     def advance(self, state, begin, end):
-        """The state after iteration `end`, and what is kept since `begin`: arrays `(chains, draws,
-        ...)` by name.
-        """
+        """The state after iteration `end`, and arrays `(chains, draws, ...)` kept since `begin`."""
         state, draws = self._program(state, (begin, end))
         named, draws = gather((_named(_plain(state)), draws))
         kept = {}
         for name, x in draws.items():
             x = np.asarray(x)
+            # chains in front: a vectorised batch has its draws there, one chain has no axis
             x = x.swapaxes(0, 1) if self.batched else x[None] if self.mcmc.num_chains == 1 else x
+            # the program's arrays are as long as any interval needs
             kept[name] = x[:, : self.count(name, end) - self.count(name, begin)]
         return _rebuilt(named, self.start), kept if any(x.size for x in kept.values()) else {}
 
@@ -226,6 +253,7 @@ class _Chains:
     def count(self, name, i):
         """How many draws the first i iterations leave."""
         every = self.mcmc.thinning * (self.keep_noise if name.startswith("noise/") else 1)
+        # without a branch, since i may be traced
         return (i > self.mcmc.num_warmup) * (i - self.mcmc.num_warmup) // every
 
     def diagnostics(self, state) -> str:
@@ -239,10 +267,10 @@ class _Chains:
     def _collect(self, state):
         """The fields of a draw, as `MCMC` has them, and the noise apart."""
         fields = {name: nested_attrgetter(name)(state) for name in self.fields}
+        # constrained here, so that files hold what users see
         constrain = self.mcmc.postprocess_fn or self.sampler.postprocess_fn(self.args, self.kwargs)
-        samples = (jax.vmap(constrain) if self.batched else constrain)(
-            fields[self.mcmc._sample_field]
-        )
+        constrain = jax.vmap(constrain) if self.batched else constrain
+        samples = constrain(fields[self.mcmc._sample_field])
         if isinstance(samples, dict):
             if self.keep_noise and self.noise:
                 fields["noise"] = {k: v for k, v in samples.items() if k in self.noise}
@@ -250,14 +278,11 @@ class _Chains:
         return _plain(jax.tree.map(_array, fields | {self.mcmc._sample_field: samples}))
 
     def _advance(self, state, bounds):
-        """Iterations of one chain, or of a vectorised batch, between two numbers that are known
-        only when it runs.
-        """
+        """Iterations of a chain, or a vectorised batch, between bounds known only at run time."""
         begin, end = bounds
-        empty = {
-            k: jnp.zeros(x.shape, x.dtype)
-            for k, x in _named(jax.eval_shape(self._collect, state)).items()
-        }
+        shapes = _named(jax.eval_shape(self._collect, state))
+        empty = {k: jnp.zeros(x.shape, x.dtype) for k, x in shapes.items()}
+        # as many as an interval after the warm-up keeps: one program serves every interval
         sizes = {name: self.count(name, self.mcmc.num_warmup + self.interval) + 1 for name in empty}
 
         def step(i, carry):
@@ -267,9 +292,11 @@ class _Chains:
             def is_kept(name):
                 return self.count(name, i + 1) > self.count(name, i)
 
+            # noise is kept at some of the draws only, so "" asks for all that may be kept
             draw = jax.lax.cond(
                 is_kept(""), lambda state: _named(self._collect(state)), lambda _: empty, state
             )
+            # what is not kept is written out of range, which JAX drops
             places = {
                 k: jnp.where(is_kept(k), self.count(k, i) - self.count(k, begin), sizes[k])
                 for k in draw
@@ -281,17 +308,18 @@ class _Chains:
 
 
 def _over_chains(mcmc, mesh, fn, jit=lambda fn: fn):
-    """`fn(x, common)`, x being of one chain, for all chains: on the devices of a mesh, or by the
-    method of `mcmc`.
-    """
+    """`fn(x, common)`, x of one chain, for all: on a mesh, or by the chain method of `mcmc`."""
     method = mcmc.chain_method
     if mesh is None and (mcmc.num_chains == 1 or method == "vectorized"):
         return jit(fn)
     if mesh is not None or method == "parallel":
-        jit, method = jax.jit, partial(spread, mesh=mesh)
+        jit = jax.jit
+        method = partial(spread, mesh=mesh)
     if not isinstance(method, str):
         return jit(lambda x, common: method(lambda x: fn(x, common))(x))
-    one, stack = jit(fn), partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
+    # "sequential": one compiled program, called for one chain after the other
+    one = jit(fn)
+    stack = partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
     return lambda x, common: stack(*[one(_chain(x, c), common) for c in range(mcmc.num_chains)])
 
 
@@ -340,6 +368,7 @@ def _rebuilt(arrays, like):
     """A tree from its named leaves on the host, with the keys and dtypes of another."""
 
     def leaf(x, new):
+        # NumPy's format knows no bfloat16: `view` gives its bytes their meaning back
         return jr.wrap_key_data(new, impl=jr.key_impl(x)) if _is_key(x) else new.view(x.dtype)
 
     leaves = [leaf(x, np.asarray(arrays[name])) for name, x in _named(like).items()]
@@ -348,29 +377,26 @@ def _rebuilt(arrays, like):
 
 def _settings_of(kernel, name) -> dict:
     """The numbers and switches of a kernel, and of its blocks."""
-    numbers = {k: v for k, v in vars(kernel).items() if isinstance(v, bool | int | float | str)}
-    settings = {name: type(kernel).__name__} | {
-        f"{name}.{k.lstrip('_')}": v for k, v in numbers.items()
-    }
+    settings: dict = {name: type(kernel).__name__}
+    for field, value in vars(kernel).items():
+        if isinstance(value, bool | int | float | str):
+            settings[f"{name}.{field.lstrip('_')}"] = value
+    # the blocks of `Gibbs`
     for i, block in enumerate(getattr(kernel, "_kernels", ())):
         settings |= _settings_of(block, f"{name}.blocks.{i}")
     return settings
 
 
 def _described(x) -> str:
-    """A value that a file can hold: short ones in full, others by a hash; of what is no array, the
-    type.
-    """
+    """A value that a file can hold: a short one in full, others by a hash or their type."""
     if not hasattr(x, "dtype"):
-        return (
-            repr(x) if isinstance(x, bool | int | float | complex | str) else type(x).__qualname__
-        )
+        # the `repr` of an object has its address, which differs from run to run
+        plain = isinstance(x, bool | int | float | complex | str)
+        return repr(x) if plain else type(x).__qualname__
     data = np.asarray(jr.key_data(x) if _is_key(x) else x)
-    value = (
-        data.tolist()
-        if data.size <= 8
-        else f"with SHA-256 {hashlib.sha256(data.tobytes()).hexdigest()[:12]}"
-    )
+    value = data.tolist()
+    if data.size > 8:
+        value = f"with SHA-256 {hashlib.sha256(data.tobytes()).hexdigest()[:12]}"
     return f"{x.dtype}{list(x.shape)} {value}"
 
 
@@ -402,13 +428,16 @@ def _load_state(folder, chains):
         {"iterations", "settings", "start"} <= set(stored),
         f"{file} is of another program. Choose another `path`.",
     )
-    old, new = json.loads(str(stored["settings"])), chains.settings
+    # both ways: a setting that only one of the two has differs as well
+    old = json.loads(str(stored["settings"]))
+    new = chains.settings
     for name in dict.fromkeys([*new, *old]):
         require(
             old.get(name) == new.get(name),
             f"`path` {folder} holds a run with another {name}: {old.get(name)} there, "
             f"{new.get(name)} in this call. Choose another path, or go back to the old setting.",
         )
+    # a warning only: the start differs by rounding between versions, and a model is no setting
     if not np.allclose(stored["start"], chains.fingerprint, rtol=1e-5):
         warnings.warn(
             f"the chains of `path` {folder} started elsewhere than this call would start them: "
@@ -426,17 +455,15 @@ def _load_draws(folder, chains, done) -> dict:
     """The draws of the intervals before `done`, by name; none before the end of the warm-up."""
     if not (expected := chains.count("", done)):
         return {}
-    files = [
-        file
+    # by name is by number, which has leading zeros; later files are of an interval cut off
+    parts = [
+        _read(file)
         for file in sorted(folder.glob("draws_*.npz"))
         if int(file.stem.removeprefix("draws_")) < done
     ]
-    parts = [_read(file) for file in files]
-    draws = (
-        {name: np.concatenate([part[name] for part in parts], 1) for name in _named(chains.draw)}
-        if parts
-        else {}
-    )
+    draws = {}
+    for name in _named(chains.draw) if parts else ():
+        draws[name] = np.concatenate([part[name] for part in parts], 1)
     found = next(iter(draws.values())).shape[1] if draws else 0
     require(
         found == expected,
@@ -447,8 +474,10 @@ def _load_draws(folder, chains, done) -> dict:
 
 def _hand_over(folder, chains, state, done) -> None:
     """Leaves `mcmc` as after `run`."""
-    draws, mcmc = _load_draws(folder, chains, done), chains.mcmc
-    mcmc._args, mcmc._kwargs = chains.args, chains.kwargs
+    draws = _load_draws(folder, chains, done)
+    mcmc = chains.mcmc
+    mcmc._args = chains.args
+    mcmc._kwargs = chains.kwargs
     mcmc._last_state = jax.tree.map(jnp.asarray, state)
     mcmc._states = jax.tree.map(jnp.asarray, _rebuilt(draws, chains.draw)) if draws else None
     mcmc._states_flat = None

@@ -55,9 +55,13 @@ from ._rotation import choose, half_square, metropolis, normal_like, trajectory
 _ESS = 0.5
 """Between neighbouring temperatures, of the pilot's particles: a fraction of their number."""
 _ACCEPTANCE = 0.8
-_LENGTH, _JITTER = 1.6, 0.2
+"""Which the step sizes of the pilot run aim at."""
+_LENGTH = 1.6
 """Angle of a trajectory, in radians: about π/2, which forgets a standard normal."""
+_JITTER = 0.2
+"""A fraction of it, so that no angle comes back again and again to where it was."""
 _MAX_STEPS = 32
+"""Of a trajectory: it bounds the time of a temperature at which steps are hardly accepted."""
 _LEAST_CHANGE = 1e-4
 """Of β: the ESS may be smaller where log weights vary by thousands of nats."""
 
@@ -102,6 +106,7 @@ class TemperedEvidence(eqx.Module):
         least = float(np.min(self.accept_prob))
         if least < 0.2:
             return f"moves are hardly accepted (mean {least:.2f} at one temperature)"
+        # pseudo-values of a jackknife are no estimates of their own: no such rule for "bridge"
         spread = float(jnp.std(self.log_estimates, ddof=1))
         if spread > 1.5 and self.method == "smc":
             return f"islands differ by {spread:.1f} nats (SD): give more particles or moves"
@@ -109,7 +114,8 @@ class TemperedEvidence(eqx.Module):
 
     def __str__(self) -> str:
         found = f"log evidence {float(self.log_evidence):.4g} ± {float(self.standard_error):.2g}"
-        runs, count = len(self.log_estimates), len(self.inverse_temperatures) - 1
+        runs = len(self.log_estimates)
+        count = len(self.inverse_temperatures) - 1
         of = f"{runs} islands of {self.num_particles} particles"
         if self.method == "bridge":
             of = f"{runs} chains of {self.num_particles} draws"
@@ -147,6 +153,8 @@ def estimate_tree_evidence(
 
 
 def _observed(law, data):
+    """A model that has the law alone."""
+    # a plate for each axis of the batch, the last being −1
     with ExitStack() as stack:
         for i, size in enumerate(law.batch_shape[::-1], 1):
             stack.enter_context(numpyro.plate(f"axis_{i}", size, dim=-i))
@@ -204,6 +212,8 @@ def estimate_model_evidence(
         mesh_for(num_islands, "`num_islands`", mesh)
     run = _Run(model, model_args, model_kwargs or {}, batch_size, mesh)
     key_pilot, key = jr.split(key)
+    # The schedule must not depend on the particles that it weighs, or "smc" would be biased: the
+    # pilot finds it with particles of its own.
     with tqdm(desc="temperatures", disable=not progress) as bar:
         particles, stages, rates = _pilot(run, key_pilot, num_particles, num_moves, bar)
         bar.total = bar.n + len(stages) * (num_islands if method == "smc" else 1)
@@ -215,9 +225,8 @@ def estimate_model_evidence(
             estimates, log_evidence, error = _of_islands(jnp.stack(found))
         else:
             draws = _ladder(run, key, particles, stages, num_islands, num_particles, bar)
-            estimates, log_evidence, error = _of_ladder(
-                draws, np.diff([0.0, *(float(s.beta) for s in stages)])
-            )
+            changes = np.diff([0.0, *(float(stage.beta) for stage in stages)])
+            estimates, log_evidence, error = _of_ladder(draws, changes)
     betas = np.array([0.0, *(float(stage.beta) for stage in stages)])
     return TemperedEvidence(
         log_evidence, error, estimates, betas, np.array(rates), num_particles, method
@@ -232,9 +241,7 @@ class _Particles(NamedTuple):
 
 
 class _Stage(NamedTuple):
-    """A temperature, the steps of a trajectory there, and the reference by which parameters are
-    whitened.
-    """
+    """A temperature, the steps of a trajectory there, and what whitens the parameters."""
 
     beta: Array
     num_steps: Array
@@ -245,17 +252,19 @@ class _Run:
     """The programs of one model."""
 
     def __init__(self, model, model_args, model_kwargs, batch_size: int, mesh: Mesh | None):
-        self._model, self._args, self._kwargs = model, model_args, model_kwargs
-        sites = {
-            name: site
-            for name, site in sites_of(model, model_args, model_kwargs).items()
-            if is_latent(site)
-        }
+        self._model = model
+        self._args = model_args
+        self._kwargs = model_kwargs
+        every = sites_of(model, model_args, model_kwargs)
+        sites = {name: site for name, site in every.items() if is_latent(site)}
         _check_sites(sites)
         self._noise = {name for name, site in sites.items() if is_noise(site)}
+        # shapes and order of the parameters are those of any draw
         self._unravel = self._parts(_unconstrained(sites))[2]
         self._spread = partial(spread, mesh=mesh, batch_size=batch_size)
-        start, move = jax.jit(self._start), jax.jit(self._move, static_argnames="num_moves")
+        # compiled once for all temperatures and islands: β and the steps are arguments
+        start = jax.jit(self._start)
+        move = jax.jit(self._move, static_argnames="num_moves")
         self.start = lambda keys: gather(start(keys))
         self.move = lambda *args: gather(move(*args))
         self.resample = jax.jit(_resampled)
@@ -277,36 +286,37 @@ class _Run:
         """The reference of the parameters of all particles."""
         theta = jax.vmap(lambda z: self._parts(z)[0])(z)
         mean = jnp.mean(theta, 0)
-        rest, start = theta - mean, Reference(mean, jnp.eye(mean.size, dtype=mean.dtype))
-        return (
-            if_finite(from_moments(mean, rest.T @ rest, len(theta)), start) if mean.size else start
-        )
+        rest = theta - mean
+        start = Reference(mean, jnp.eye(mean.size, dtype=mean.dtype))
+        if not mean.size:
+            return start
+        return if_finite(from_moments(mean, rest.T @ rest, len(theta)), start)
 
     def _start(self, keys) -> _Particles:
         """Draws from the prior."""
 
         def one(key):
-            trace = handlers.trace(handlers.seed(self._model, key)).get_trace(
-                *self._args, **self._kwargs
-            )
+            seeded = handlers.seed(self._model, key)
+            trace = handlers.trace(seeded).get_trace(*self._args, **self._kwargs)
             z = _unconstrained({name: site for name, site in trace.items() if is_latent(site)})
             return _Particles(z, self._evaluate(z)[1])
 
         return self._spread(one)(keys)
 
     def _move(self, particles: _Particles, key, stage: _Stage, num_moves: int):
-        """Every particle moved on its own: where it is, its mean acceptance, and log p(v | θ, z)
-        after each move.
-        """
+        """Every particle moved: where it is, mean acceptance, log p(v | θ, z) after each move."""
 
         reference = stage.reference
 
+        # x = (y, z): whitened parameters θ = μ + L y, and the noise
         def to_sites(x):
             return self._unravel(reference.colour(x[0])) | x[1]
 
         def one(particle, key):
             def psi(x):
                 prior, log_likelihood = self._evaluate(to_sites(x))
+                # Ψ of exp(−Ψ) N(y; 0, I) N(z; 0, I) ∝ p(θ) N(z; 0, I) p(v | θ, z)^β: the moves
+                # keep the two normal laws exactly, and Ψ is what they must correct
                 return prior - half_square(x[0]) - stage.beta * log_likelihood, log_likelihood
 
             value_and_grad = jax.value_and_grad(psi, has_aux=True)
@@ -318,6 +328,7 @@ class _Run:
                 key_momentum, key_angle, key_accept = jr.split(key, 3)
                 p = normal_like(key_momentum, x)
                 turn = _LENGTH * jr.uniform(key_angle, (), value[0].dtype, 1 - _JITTER, 1 + _JITTER)
+                # one program for the evaluation and the moves: it has the gradient once
                 steps = jnp.where(still, 1, stage.num_steps)
                 angle = jnp.where(still, 0.0, turn / steps)
                 y, _, new, slope, work = trajectory(
@@ -329,6 +340,7 @@ class _Run:
 
             theta, noise, _ = self._parts(particle.z)
             x = reference.whiten(theta), noise
+            # Ψ and its gradient depend on β and the reference: move 0 finds them
             value = jnp.zeros_like(particle.log_likelihood), particle.log_likelihood
             start = x, value, jax.tree.map(jnp.zeros_like, x)
             steps = jnp.arange(num_moves + 1), jr.split(key, num_moves + 1)
@@ -365,11 +377,10 @@ def _check_sites(sites) -> None:
 
 
 def _resampled(particles: _Particles, key, change):
-    """Particles drawn in proportion to p(v | θ, z)^change, systematically, and the log of the mean
-    weight.
-    """
+    """Particles resampled systematically by p(v | θ, z)^change, and the log of the mean weight."""
     log_weights = change * particles.log_likelihood
     count = log_weights.size
+    # one uniform number places all: a particle of weight w is taken N w times, rounded up or down
     edges = jnp.cumsum(jax.nn.softmax(log_weights))
     places = (jnp.arange(count) + jr.uniform(key, (), edges.dtype)) / count * edges[-1]
     chosen = jnp.minimum(jnp.searchsorted(edges, places), count - 1)
@@ -377,23 +388,25 @@ def _resampled(particles: _Particles, key, change):
 
 
 def _pilot(run: _Run, key, num_particles, num_moves, bar):
-    """Particles of the posterior, and what a run needs to know: a stage for each temperature, and
-    acceptances.
-    """
+    """Particles of the posterior, a stage for each temperature, and acceptances."""
     key, key_start = jr.split(key)
     particles = run.start(jr.split(key_start, num_particles))
-    beta, step, stages, rates = 0.0, _LENGTH / 2, [], []
+    beta = 0.0
+    step = _LENGTH / 2
+    stages = []
+    rates = []
     while beta < 1:
         key, key_resample, key_move = jr.split(key, 3)
+        # reweighted to the next temperature, resampled, whitened by where they are, and moved
         new = _next_beta(beta, np.asarray(particles.log_likelihood, float))
         particles, _ = run.resample(particles, key_resample, new - beta)
         beta = new
         stage = _Stage(jnp.asarray(beta), jnp.asarray(_num_steps(step)), run.fitted(particles.z))
         particles, accepted, _ = run.move(particles, key_move, stage, num_moves)
         rate = float(jnp.mean(accepted))
-        step = float(
-            np.clip(step * np.exp(2 * (rate - _ACCEPTANCE)), _LENGTH / _MAX_STEPS, _LENGTH)
-        )
+        # longer steps where more than asked for are accepted, for the next temperature too
+        step = step * np.exp(2 * (rate - _ACCEPTANCE))
+        step = float(np.clip(step, _LENGTH / _MAX_STEPS, _LENGTH))
         stages.append(stage._replace(num_steps=jnp.asarray(_num_steps(step))))
         rates.append(rate)
         bar.set_postfix(pilot=f"{beta:.3g}")
@@ -402,7 +415,7 @@ def _pilot(run: _Run, key, num_particles, num_moves, bar):
 
 
 def _num_steps(step: float) -> int:
-    return math.ceil(_LENGTH / step - 1e-9)
+    return math.ceil(_LENGTH / step - 1e-9)  # not one more for rounding
 
 
 def _next_beta(beta: float, log_likelihood) -> float:
@@ -412,12 +425,15 @@ def _next_beta(beta: float, log_likelihood) -> float:
         return 1.0  # the estimate is NaN, or 0
 
     def enough(change):
+        # ESS = (Σ w)² / Σ w², of those that are possible; weights relative to the largest
         w = np.exp(change * (log_likelihood - np.max(log_likelihood)))
         return np.sum(w) ** 2 >= _ESS * possible * np.sum(w**2)
 
     if enough(1 - beta):
         return 1.0
-    low, high = _LEAST_CHANGE, 1 - beta
+    # bisection: the ESS falls as the change grows
+    low = _LEAST_CHANGE
+    high = 1 - beta
     for _ in range(40):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if enough(middle) else (low, middle)
@@ -428,13 +444,17 @@ def _island(run: _Run, key, stages, num_particles, num_moves, bar) -> Array:
     """The log evidence that one set of particles gives; its exponential is unbiased."""
     key, key_start = jr.split(key)
     particles = run.start(jr.split(key_start, num_particles))
-    log_evidence, beta = jnp.zeros(()), 0.0
+    log_evidence = jnp.zeros(())
+    beta = 0.0
     for stage in stages:
         key, key_resample, key_move = jr.split(key, 3)
         particles, log_mean = run.resample(particles, key_resample, stage.beta - beta)
-        log_evidence, beta = log_evidence + log_mean, stage.beta
+        log_evidence = log_evidence + log_mean
+        beta = stage.beta
+        # nothing is weighed after the last temperature, so that moves there are of no use
         if stage is not stages[-1]:
             particles, _, _ = run.move(particles, key_move, stage, num_moves)
+        # or JAX would run ahead of the bar
         jax.block_until_ready(particles)
         bar.update()
     return log_evidence
@@ -442,6 +462,7 @@ def _island(run: _Run, key, stages, num_particles, num_moves, bar) -> Array:
 
 def _of_islands(estimates):
     """The log of their mean, and its standard error by the delta method."""
+    # SD(log mean) ≈ SD(mean) / mean
     log_evidence = log_mean_exp(estimates)
     ratios = jnp.exp(estimates - log_evidence)
     return estimates, log_evidence, jnp.std(ratios, ddof=1) / math.sqrt(estimates.size)
@@ -457,6 +478,7 @@ def _ladder(run: _Run, key, particles, stages, num_chains, num_draws, bar):
     chosen = jr.choice(key_start, len(particles.log_likelihood), (num_chains,), replace=False)
     chains = jax.tree.map(lambda a: a[chosen], particles)
     found = []
+    # downwards: a chain that has mixed at one temperature is nearly mixed at the next, wider one
     for i, stage in enumerate(stages[::-1]):
         key, key_warmup, key_move = jr.split(key, 3)
         warmup = num_draws if i == 0 else max(num_draws // 4, 1)
@@ -464,8 +486,10 @@ def _ladder(run: _Run, key, particles, stages, num_chains, num_draws, bar):
         chains, _, history = run.move(chains, key_move, stage, num_draws)
         found.append(np.asarray(history, float))
         bar.update()
+    # β = 0 is the prior, from which independent draws can be had
     prior = run.start(jr.split(key_prior, num_chains * num_draws)).log_likelihood
-    return np.stack([np.asarray(prior, float).reshape(num_chains, num_draws), *found[::-1]])
+    prior = np.asarray(prior, float).reshape(num_chains, num_draws)
+    return np.stack([prior, *found[::-1]])
 
 
 def _of_ladder(draws, changes):
@@ -478,6 +502,8 @@ def _of_ladder(draws, changes):
             _log_ratio(change * lower[kept], change * upper[kept]) for change, lower, upper in pairs
         )
 
+    # Chains are independent, their draws are not. Without chain c the estimate moves by about
+    # 1/chains of what the chain says, which the pseudo-value magnifies again.
     every = np.arange(chains)
     whole = estimate(every)
     values = jnp.asarray([chains * whole - (chains - 1) * estimate(every != c) for c in every])
@@ -486,6 +512,8 @@ def _of_ladder(draws, changes):
 
 def _log_ratio(lower, upper) -> float:
     """log Z' / Z by bridge sampling, from log weights q' / q of equally many draws of each."""
+    # r = E_lower[w / (w + r)] / E_upper[1 / (w + r)], w = q' / q, iterated to its fixed point: for
+    # equally many draws the estimate of least variance [@meng1996]
     ratio = _log_mean(lower)
     for _ in range(200):
         old = ratio

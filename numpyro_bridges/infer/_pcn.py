@@ -121,11 +121,16 @@ class AbstractPCN(AbstractBridgeKernel):
         require(
             not few, f"`num_blocks` must be at most the number of time steps; {few} have fewer."
         )
+        # which site each noise drives, by the model's own structure: where noises have other uses,
+        # all are decided together
         self._owners = driven_by(self._model, model_args, model_kwargs, z)
         self._cuts = self._cut(z)
         energies, force = self._evaluate(z, model_args, model_kwargs)
         angles = tuple(jnp.full_like(energy, self._angle) for energy in energies)
-        i, zero, no = jnp.array(0), jnp.zeros_like(total(energies)), jnp.array(False)
+        # an angle for each decision: data that are hard to move get small ones of their own
+        i = jnp.array(0)
+        zero = jnp.zeros_like(total(energies))
+        no = jnp.array(False)
         return PCNState(
             i, z, _potential(z, energies), energies, force, angles, zero, zero, no, key, UNSEALED
         )
@@ -134,6 +139,7 @@ class AbstractPCN(AbstractBridgeKernel):
         """How the noise of each group is cut."""
         if self._kind is None:
             return [_TimeBlocks(self._num_blocks)] * len(groups_of(z, self._owners))
+        # energies by branch exist for the noise of trees alone, which must have no other use
         require(
             any(blocks is not None for blocks in self._blocks.values()),
             "`blocks` needs the noise of a `DiffusionTree`, of `numpyro_bridges.sample`; "
@@ -171,6 +177,8 @@ class AbstractPCN(AbstractBridgeKernel):
             return state, rates + rate / self._num_moves
 
         start = (state._replace(diverging=jnp.array(False)), jnp.zeros_like(state.accept_prob))
+        # `still`: a draw that starts a chain again renews the energies and moves nothing; one move
+        # of no angle does it, without a second copy of the model in the program
         new, rate = jax.lax.fori_loop(0, jnp.where(still, 1, self._num_moves), move, start)
         return new._replace(
             i=state.i + 1,
@@ -181,23 +189,28 @@ class AbstractPCN(AbstractBridgeKernel):
         )
 
     def _move(self, key, m, state, still, model_args, model_kwargs):
-        """Turns the noise of one block of time steps, or of one level of a tree, and decides for
-        each datum.
-        """
+        """Turns the noise of one block, or one level of a tree, and decides for each datum."""
         key_p, key_accept = jr.split(key)
-        old, groups = state.z, groups_of(state.z, self._owners)
+        old = state.z
+        groups = groups_of(state.z, self._owners)
+        # blocks and levels take turns by the number of the move, over the whole chain
         number = state.i * self._num_moves + m
         turns = {
             name: cut.turns(number, jnp.where(still, 0.0, angle), old[name])
             for group, cut, angle in zip(groups, self._cuts, state.angles, strict=True)
             for name in group
         }
+        # kick, turn, kick: reversible, and of volume 1. What the kicks change of ½ |p|² is the
+        # work by which the ratio of likelihoods is corrected; without a force there is none.
         p, before = _kicked(normal_like(key_p, old), state.force, turns)
         new, p = rotate(old, p, turns)
         energies, force = self._evaluate(new, model_args, model_kwargs)
         _, after = _kicked(p, force, turns)
 
-        accept, decisions, rates, asked = {}, [], [], []
+        accept = {}
+        decisions = []
+        rates = []
+        asked = []
         for key, group, cut, e_new, e_old in zip(
             jr.split(key_accept, len(groups)),
             groups,
@@ -206,6 +219,7 @@ class AbstractPCN(AbstractBridgeKernel):
             state.energies,
             strict=True,
         ):
+            # each decision by the energy and the work of its own noise
             work = sum(
                 cut.summed(before[name] + after[name], e_new) for name in group if name in force
             )
@@ -213,6 +227,7 @@ class AbstractPCN(AbstractBridgeKernel):
             accepted = cut.applied(number, decision) | still
             accept |= {name: cut.widened(accepted, old[name]) for name in group}
             decisions.append(accepted)
+            # branches of other levels have no rate in this move, and do not adapt
             asked.append(jnp.broadcast_to(cut.asked(number), rate.shape))
             rates.append(jnp.where(asked[-1], rate, 0.0))
 
@@ -235,6 +250,7 @@ class AbstractPCN(AbstractBridgeKernel):
         """Robbins-Monro: the rate tends to its target, or stays above it at the angle π/2."""
         if not self._adapt_angle:
             return angle
+        # steps whose sum is infinite and whose squares have a finite one
         gain = (state.i + 1.0) ** -0.6
         new = jnp.clip(angle * jnp.exp(gain * (rate - self._target)), 1e-3, pi / 2)
         return jnp.where(self._warming(state), new, angle)
@@ -269,9 +285,7 @@ class PCN(AbstractPCN):
 
 
 class PCNL(AbstractPCN):
-    """Preconditioned Crank-Nicolson Langevin moves of the noise: `PCN` with gradients, which pay
-    where φ is small.
-    """
+    """Preconditioned Crank-Nicolson Langevin moves: `PCN` with gradients, for small φ."""
 
     def __init__(self, model, *, target_accept_prob: float = 0.7, **settings):
         super().__init__(model, target_accept_prob=target_accept_prob, **settings)
@@ -291,14 +305,13 @@ def _potential(z, energies):
 
 def _kicked(p, force, turns):
     """Forces act for half of the turn, where there are any."""
+    # `PCN` has an empty force
     new, change = kick({n: p[n] for n in force}, force, {n: 0.5 * turns[n] for n in force})
     return p | new, change
 
 
 class AbstractBlocks(ABC):
-    """Which noise a move turns, and what is decided; energies and angles are shaped as the
-    decisions.
-    """
+    """Which noise a move turns, and what is decided; energies and angles have its shape."""
 
     @abstractmethod
     def turns(self, number, angle, noise) -> Array:
@@ -326,9 +339,7 @@ class AbstractBlocks(ABC):
 
 
 class _TimeBlocks(AbstractBlocks):
-    """Blocks of time steps, an axis of the noise `(..., num_steps, k, dim)`. Each datum is decided
-    on its own.
-    """
+    """Blocks of time steps, axis −3 of the noise. Each datum is decided on its own."""
 
     def __init__(self, num_blocks: int):
         self._num_blocks = num_blocks
@@ -336,6 +347,7 @@ class _TimeBlocks(AbstractBlocks):
     def turns(self, number, angle, noise):
         if self._num_blocks == 1:
             return self.widened(angle, noise)
+        # step i belongs to block ⌊i · blocks / steps⌋, so that sizes differ by one at most
         steps = noise.shape[-3]
         inside = jnp.arange(steps) * self._num_blocks // steps == number % self._num_blocks
         return self.widened(angle, noise) * inside.astype(noise.dtype)[:, None, None]
@@ -357,14 +369,14 @@ class _TimeBlocks(AbstractBlocks):
 
 
 class _TreeBlocks(AbstractBlocks):
-    """Branches of a tree, with an energy each, one after the other in the time steps. A move takes
-    one level.
-    """
+    """Branches of a tree, each with an energy and rows of noise. A move takes one level."""
 
     def __init__(self, blocks: NoiseBlocks, whole_clades: bool):
         above = blocks.above
-        self._count, self._whole_clades = len(above), whole_clades
+        self._count = len(above)
+        self._whole_clades = whole_clades
         self._rows = np.repeat(np.arange(len(above)), blocks.sizes)
+        # the branches from the root to each, itself included: its level is their number
         lineages = []
         for i, parent in enumerate(above):
             lineages.append([*(lineages[parent] if parent >= 0 else []), i])
@@ -376,6 +388,7 @@ class _TreeBlocks(AbstractBlocks):
             self._owners[: len(lineage), i] = lineage
 
     def _owner(self, number):
+        """For each branch the one of this move's level at or above it, with which it is decided."""
         return jnp.asarray(self._owners)[number % len(self._owners)]
 
     def turns(self, number, angle, noise):
@@ -386,10 +399,13 @@ class _TreeBlocks(AbstractBlocks):
         return self._owner(number) == jnp.arange(self._count)
 
     def judged(self, number, change):
+        # all that changes below a branch of the level is its own; branches above the level do not
+        # change, and are added up at one place more
         total = jnp.zeros((*change.shape[:-1], self._count + 1), change.dtype)
         return total.at[..., self._owner(number)].add(change)[..., :-1]
 
     def applied(self, number, decision):
+        # that place, of branches that no decision is about, is False
         padded = jnp.concatenate([decision, jnp.zeros_like(decision[..., :1])], -1)
         return padded[..., self._owner(number)]
 

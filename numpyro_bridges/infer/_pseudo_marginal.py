@@ -76,6 +76,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         mesh: Mesh | None = None,
     ):
         super().__init__(model, init_strategy, mesh)
+        # u' = cos(φ) u + sin(φ) ξ with ρ = cos(φ)
         self._turn = math.acos(known_number(correlation, "correlation", *PROPORTION_OR_0))
         self._step_size = step_size
         if step_size is not None:
@@ -87,9 +88,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
 
     @abstractmethod
     def _evaluate(self, potential, theta: Array) -> tuple:
-        """The potential, `(value, energies)`, and minus its gradient, or none of it for a random
-        walk.
-        """
+        """The potential, `(value, energies)`, and minus its gradient, 0 for a random walk."""
 
     @abstractmethod
     def _best_step(self, d: int) -> float:
@@ -101,12 +100,14 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         return self._num_particles
 
     def get_diagnostics_str(self, state):
-        step, rate = float(state.step_size), float(state.mean_accept_prob)
+        step = float(state.step_size)
+        rate = float(state.mean_accept_prob)
         return f"{self._num_particles} particles, step size {step:.2e}. acc. prob={rate:.2f}"
 
     def _check(self, model_args, model_kwargs):
         sites = super()._check(model_args, model_kwargs)
         if self._num_particles is None:
+            # N is a shape: it must be a number here, even where NumPyro traces the start
             with jax.ensure_compile_time_eval():
                 log_weights = self._pilot(model_args, model_kwargs)
             pilot = [concrete(w) for w in log_weights]
@@ -132,9 +133,11 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
                 z = unravel(reference.mean) | normal_like(key, noise)
                 return energies_of(self._model, model_args, model_kwargs, z, self._owners)[1]
 
+            # a few at a time, for memory
             energies = jax.lax.map(one, jr.split(key_noise, _PILOT), batch_size=32)
             return [-energy.reshape(_PILOT, -1) for energy in energies]
 
+        # a key of its own: N is a setting of the kernel, the same for every chain
         return log_weights(jr.key(0))
 
     def _init_one(self, key, z, reference, model_args, model_kwargs):
@@ -152,8 +155,10 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         (value, energies), force = self._evaluate(potential, theta)
         z = unravel(theta) | self._pick(key_pick, particles, energies)
         step = self._best_step(theta.size) if self._step_size is None else self._step_size
-        zero, no = jnp.zeros_like(value), jnp.array(False)
-        windows, i = start_windows(reference), jnp.array(0)
+        zero = jnp.zeros_like(value)
+        no = jnp.array(False)
+        windows = start_windows(reference)
+        i = jnp.array(0)
         step = jnp.asarray(step, value.dtype)
         return PseudoMarginalState(
             i, z, particles, value, force, step, windows, zero, zero, no, key, UNSEALED
@@ -170,9 +175,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         return state._replace(potential_energy=value, force=force)
 
     def _potential(self, particles, unravel, model_args, model_kwargs):
-        """-log of the prior and of the estimate, as a function of θ, and the energies of the
-        particles.
-        """
+        """-log of prior and estimate as a function of θ, and the energies of the particles."""
 
         def potential(theta):
             sites = unravel(theta)
@@ -183,19 +186,21 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
                 )
 
             rest, energies = jax.vmap(one)(particles)
+            # log 1/N Σ_i p(v_s | θ, u_{s,i}), for each datum s before their sum: particles of one
+            # datum are averaged whatever those of others are
             estimates = [logsumexp(-energy, axis=0) - math.log(len(energy)) for energy in energies]
+            # the prior of θ, the same for every particle
             return rest[0] - total(estimates), energies
 
         return potential
 
     def _pick(self, key, particles, energies):
-        """For each datum, the noise of one particle, with probabilities proportional to the
-        weights.
-        """
+        """For each datum the noise of one particle, drawn in proportion to the weights."""
         groups = groups_of(particles, self._owners)
         picked = {}
         keys = jr.split(key, len(groups))
         for key_g, group, energy in zip(keys, groups, energies, strict=True):
+            # noises of one group are weighed together, and come from one particle
             index = jr.categorical(key_g, -energy, axis=0)
             for name in group:
                 u = particles[name]
@@ -207,26 +212,26 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         key, key_p, key_u, key_accept, key_pick = jr.split(state.rng_key, 5)
         theta, _, unravel = self._parts(state.z)
         reference = state.windows.reference
+        # `still`: a step of no length, which evaluates where the chain starts again
         step_size = state.step_size * ~still
         half = 0.5 * step_size
-        p, before = kick(
-            jr.normal(key_p, theta.shape, theta.dtype), reference.whiten_gradient(state.force), half
-        )
+        # In y = L⁻¹ (θ − μ): kick, move, kick. Without a force it is a random walk, y' = y + ε p;
+        # with one it is one leapfrog step, which is MALA's proposal.
+        p = jr.normal(key_p, theta.shape, theta.dtype)
+        p, before = kick(p, reference.whiten_gradient(state.force), half)
         theta_new = theta + step_size * reference.scale @ p
-        particles, _ = rotate(
-            state.particles, normal_like(key_u, state.particles), self._turn * ~still
-        )
+        # the noise of all particles turns with it: this keeps N(0, I), so that the ratio of
+        # estimates alone decides
+        fresh = normal_like(key_u, state.particles)
+        particles, _ = rotate(state.particles, fresh, self._turn * ~still)
         potential = self._potential(particles, unravel, model_args, model_kwargs)
         (value, energies), force = self._evaluate(potential, theta_new)
         _, after = kick(p, reference.whiten_gradient(force), half)
+        # the old estimate is the one in the state: drawn anew, it would change the target
         error = value - state.potential_energy + total(before) + total(after)
         rate, accept = metropolis(key_accept, error)
-        moved = (
-            unravel(theta_new) | self._pick(key_pick, particles, energies),
-            particles,
-            value,
-            force,
-        )
+        z_new = unravel(theta_new) | self._pick(key_pick, particles, energies)
+        moved = z_new, particles, value, force
         kept = state.z, state.particles, state.potential_energy, state.force
         z, particles, value, force = choose(accept | still, moved, kept)
         windows, _ = update_windows(state.windows, state.i, self._num_warmup, self._parts(z)[0])
@@ -293,13 +298,15 @@ class CorrelatedPseudoMarginalMALA(AbstractPseudoMarginal):
 
 
 def _choose(log_weights, largest: int) -> int:
-    """The smallest number of particles by which the log estimate varies little enough, from pilot
-    weights.
-    """
+    """The fewest particles by which the log estimate varies little enough, from pilot weights."""
+    # fixed, so that the same model and data have the same N
     rng = np.random.default_rng(0)
     pilot = [np.asarray(w, float) for w in log_weights]
     _warn_of_tails(np.concatenate(pilot, axis=1).T)
-    counts = [n for k in range(11) for n in (2**k, 3 * 2**k // 2 if k else 0) if 0 < n <= largest]
+    # 1, 2, 3, 4, 6, 8, 12, ...
+    powers = [2**k for k in range(11)]
+    between = [3 * n // 2 for n in powers[1:]]
+    counts = sorted(n for n in powers + between if n <= largest)
     for n in counts:
         sd = np.std(sum(_resampled(rng, w, n) for w in pilot))
         if sd <= _BEST_SD:
@@ -322,6 +329,7 @@ def _warn_of_tails(log_weights) -> None:
     """
     with jax.ensure_compile_time_eval():
         shapes = np.clip(np.asarray(weights.pareto_k(log_weights)), 0.0, 2.0)
+    # (1 + k)/√M is the standard error of a shape from the M largest weights, here about 3 √S of S
     surely = shapes - 2 * (1 + shapes) / np.sqrt(3 * np.sqrt(log_weights.shape[1]))
     if np.mean(shapes) < 1 and np.max(surely) < weights.pareto_k_threshold(log_weights.shape[1]):
         return
@@ -338,5 +346,7 @@ def _resampled(rng, log_weights, n, replicates=500):
     """Log estimates of all data from n of the pilot weights, drawn anew in each replicate."""
     picks = rng.integers(len(log_weights), size=(replicates, n, log_weights.shape[1]))
     values = np.take_along_axis(log_weights[None], picks, axis=1)
+    # a log mean of exponentials, relative to the largest
     top = values.max(1, keepdims=True)
-    return np.sum(top[:, 0] + np.log(np.mean(np.exp(values - top), 1)), -1)
+    log_means = top[:, 0] + np.log(np.mean(np.exp(values - top), 1))
+    return np.sum(log_means, -1)

@@ -40,12 +40,12 @@ class Reference(NamedTuple):
 
 
 def laplace(potential, theta: Array) -> Reference:
-    """The mode of exp(-potential) and its inverse Hessian, both by BFGS from θ; N(θ, I) where that
-    fails.
-    """
+    """Mode and inverse Hessian of exp(-potential) by BFGS from θ; N(θ, I) where that fails."""
     start = Reference(theta, jnp.eye(theta.size, dtype=theta.dtype))
+    # a model of noise alone
     if not theta.size:
         return start
+    # the Hessian as BFGS has it: differentiation would compile derivatives of the gradient
     mode, inverse_hessian = _bfgs(jax.value_and_grad(potential), theta)
     return if_finite(Reference(mode, jnp.linalg.cholesky(inverse_hessian)), start)
 
@@ -57,9 +57,7 @@ _ROUNDING = 100.0
 
 
 class _Search(NamedTuple):
-    """The best point x so far, its value, slope and the inverse Hessian there; x + step is tried
-    next.
-    """
+    """The best x so far, with value, slope and inverse Hessian; x + step is tried next."""
 
     x: Array
     value: Array
@@ -82,25 +80,30 @@ def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
     def go_on(search: _Search):
         # a step that promises less than rounding would fill the inverse Hessian with noise
         promised = -search.slope @ search.step
-        moves = (jnp.max(jnp.abs(search.slope)) > _GRADIENT_TOLERANCE) & (
-            promised > rounding * (1 + jnp.abs(search.value))
-        )
-        return (moves | (search.num_evaluations == 0)) & (search.num_evaluations < _MAX_EVALUATIONS)
+        steep = jnp.max(jnp.abs(search.slope)) > _GRADIENT_TOLERANCE
+        moves = steep & (promised > rounding * (1 + jnp.abs(search.value)))
+        # before the first evaluation the slope is 0, and means nothing
+        moves = moves | (search.num_evaluations == 0)
+        return moves & (search.num_evaluations < _MAX_EVALUATIONS)
 
     def body(search: _Search):
         x, value, slope, inverse, step, count = search
         new_value, new_slope = value_and_grad(x + step)
+        # Armijo's rule; a NaN is no descent, so that the step is halved there too
         enough = new_value <= value + 1e-4 * slope @ step
         good = enough & jnp.all(jnp.isfinite(new_slope))
         updated = _inverse_update(inverse, step, new_slope - slope)
         inverse = choose(good & (count > 0), updated, inverse)
         x, value, slope = choose(good, (x + step, new_value, new_slope), (x, value, slope))
         full = -inverse @ slope
+        # the first direction is the gradient, whose length is in no unit of x: at most 1
         length = jnp.where(count == 0, jnp.minimum(1.0, 1 / jnp.linalg.norm(full)), 1.0)
         step = choose(good, length * full, 0.5 * step)
         return _Search(x, value, slope, inverse, step, count + 1)
 
-    infinite, none = jnp.asarray(jnp.inf, x.dtype), jnp.zeros_like(x)
+    # the start has the value ∞ and the step 0: the first evaluation is of x itself, and accepted
+    infinite = jnp.asarray(jnp.inf, x.dtype)
+    none = jnp.zeros_like(x)
     start = _Search(x, infinite, none, jnp.eye(x.size, dtype=x.dtype), none, jnp.zeros((), int))
     found = jax.lax.while_loop(go_on, body, start)
     return jnp.where(jnp.isfinite(found.value), found.x, jnp.nan), found.inverse
@@ -108,6 +111,7 @@ def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
 
 def _inverse_update(inverse: Array, step: Array, change: Array) -> Array:
     """The BFGS update of the inverse Hessian; none without positive curvature."""
+    # (I − ρ s yᵀ) H⁻¹ (I − ρ y sᵀ) + ρ s sᵀ with ρ = 1 / yᵀs, positive definite for yᵀs > 0
     curvature = step @ change
     curved = curvature > 1e-12 * jnp.linalg.norm(step) * jnp.linalg.norm(change)
     rho = 1 / jnp.where(curved, curvature, 1.0)
@@ -135,6 +139,7 @@ def update_windows(
 ) -> tuple[Windows, Array]:
     """Adds draw i of the warm-up, renews the reference at the end of a window, says if it did."""
     starts, ends = _schedule(num_warmup)
+    # too few draws for a covariance, or no parameters
     if num_warmup < 20 or not theta.size:
         return windows, jnp.array(False)
     inside = (i >= starts[0]) & (i < ends[-1])
@@ -145,26 +150,20 @@ def update_windows(
 
 
 def _schedule(num_warmup: int):
-    """Starts and ends of two windows. The start is near the mode: all but a tenth before and after
-    can be used.
-    """
+    """Starts and ends of two windows, without a tenth before them and after them."""
     cuts = [int(fraction * num_warmup) for fraction in (0.1, 0.3, 0.9)]
     return cuts[:2], cuts[1:]
 
 
 def from_moments(mean, m2, n) -> Reference:
-    """Correlations are shrunk as if 5 more draws had none: the factor exists for any number of
-    draws.
-    """
+    """Shrinks correlations as if 5 more draws had none, so that there always is a factor."""
     covariance = m2 / (n - 1)
     covariance = (n * covariance + 5 * jnp.diag(jnp.diag(covariance))) / (n + 5)
     return Reference(mean, jnp.linalg.cholesky(covariance))
 
 
 def if_finite(new: Reference, old: Reference) -> Reference:
-    good = (
-        jnp.all(jnp.isfinite(new.scale))
-        & jnp.all(jnp.diag(new.scale) > 0)
-        & jnp.all(jnp.isfinite(new.mean))
-    )
+    # a coordinate that never moved has no variance, and cannot be whitened
+    finite = jnp.all(jnp.isfinite(new.scale)) & jnp.all(jnp.isfinite(new.mean))
+    good = finite & jnp.all(jnp.diag(new.scale) > 0)
     return choose(good, new, old)

@@ -1,6 +1,4 @@
-"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks by a force, trajectories, and the
-decision to accept.
-"""
+"""Moves on pytrees: the exact flow of ½ |x|² + ½ |p|², kicks, trajectories, acceptance."""
 
 import jax
 import jax.numpy as jnp
@@ -9,24 +7,25 @@ import jax.random as jr
 
 def rotate(x, p, angle):
     """x and p after a time: one for all, or a pytree of times."""
-    angle = (
-        angle
-        if jax.tree.structure(angle) == jax.tree.structure(x)
-        else jax.tree.map(lambda _: angle, x)
-    )
-    new = jax.tree.map(lambda x, p, a: jnp.cos(a) * x + jnp.sin(a) * p, x, p, angle)
-    return new, jax.tree.map(lambda x, p, a: jnp.cos(a) * p - jnp.sin(a) * x, x, p, angle)
+    # x' = p, p' = −x: a rotation, which keeps N(0, I) for x and p whatever the angle
+    angle = _for_every_leaf(angle, x)
+    new_x = jax.tree.map(lambda x, p, a: jnp.cos(a) * x + jnp.sin(a) * p, x, p, angle)
+    new_p = jax.tree.map(lambda x, p, a: jnp.cos(a) * p - jnp.sin(a) * x, x, p, angle)
+    return new_x, new_p
 
 
 def kick(p, force, time):
     """p after the force has acted for a time, and the change of ½ p² of each coordinate."""
-    time = (
-        time
-        if jax.tree.structure(time) == jax.tree.structure(p)
-        else jax.tree.map(lambda _: time, p)
-    )
+    time = _for_every_leaf(time, p)
+    # ½ (p + t f)² − ½ p², without the difference of two large numbers
     change = jax.tree.map(lambda p, f, t: (p + 0.5 * t * f) * t * f, p, force, time)
     return jax.tree.map(lambda p, f, t: p + t * f, p, force, time), change
+
+
+def _for_every_leaf(value, x):
+    """A pytree like x as it is, one value for all of x."""
+    alike = jax.tree.structure(value) == jax.tree.structure(x)
+    return value if alike else jax.tree.map(lambda _: value, x)
 
 
 def trajectory(value_and_grad, x, p, value, gradient, angle, num_steps):
@@ -41,6 +40,7 @@ def trajectory(value_and_grad, x, p, value, gradient, angle, num_steps):
 
     def leap(_, carry):
         x, p, gradient, _, work = carry
+        # the force is −∇Ψ
         p, before = kick(p, gradient, -half)
         x, p = rotate(x, p, angle)
         value, gradient = value_and_grad(x)
@@ -54,7 +54,9 @@ def trajectory(value_and_grad, x, p, value, gradient, angle, num_steps):
 
 def metropolis(key, error: jax.Array):
     """Acceptance probabilities exp(-error), 0 where it is NaN, and decisions drawn with them."""
-    rate = jnp.exp(-jnp.maximum(jnp.where(jnp.isnan(error), jnp.inf, error), 0.0))
+    # NaN is an energy that could not be computed: such a point is never accepted
+    error = jnp.where(jnp.isnan(error), jnp.inf, error)
+    rate = jnp.exp(-jnp.maximum(error, 0.0))
     return rate, jr.uniform(key, rate.shape, rate.dtype) < rate
 
 
@@ -74,6 +76,7 @@ def total(x) -> jax.Array:
 
 def normal_like(key, x, shape: tuple[int, ...] = ()):
     """Standard normal draws, with further axes in front."""
+    # a key for each leaf: with one for all, leaves of one shape would be equal
     leaves, treedef = jax.tree.flatten(x)
     keys = jr.split(key, len(leaves))
     draws = [jr.normal(k, shape + a.shape, a.dtype) for k, a in zip(keys, leaves, strict=True)]

@@ -21,9 +21,12 @@ def of_arguments(arguments):
     arrays = [leaf for leaf in leaves if _has_bits(leaf)]
     others = [leaf for leaf in leaves if not _has_bits(leaf)]
     shapes = [(jnp.shape(x), x.dtype.name) for x in arrays]
+    # without addresses, which a process that goes on with a chain would not repeat
     words = re.sub(" at 0x[0-9a-f]+", "", repr((structure, others, shapes)))
+    # not Python's `hash`, which differs from process to process
     seal = np.array([zlib.crc32(words.encode())], np.uint32)
     for x in arrays:
+        # mixed at each, so that their order counts
         seal = _mixed(seal ^ _of_bits(_bits(x)))
     return seal
 
@@ -43,6 +46,8 @@ def _bits(x):
     """The words of 32 bits of an array, `(n,)`, by NumPy unless it is traced."""
     if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         x = jr.key_data(x)
+    # Both ways must give the same words, since one data set is traced in one place and known in
+    # another: types as JAX has them, complex numbers as pairs, small types as float32.
     if not isinstance(x, Tracer):
         x = np.asarray(x)
         x = x.astype(jax.dtypes.canonicalize_dtype(x.dtype))

@@ -20,6 +20,7 @@ _HMC_FIELDS = (
     "diverging",
 )
 
+# the first that a kernel is an instance of: NUTS is a subclass of HMC
 _FIELDS = {
     HMC: _HMC_FIELDS,
     FunctionSpaceHMC: _HMC_FIELDS,
@@ -51,17 +52,17 @@ def fields(kernel) -> tuple[str, ...]:
 
 def statistics(fields: dict[str, Any], kernel) -> dict[str, Any]:
     """Arrays under ArviZ's names; those of a block of `Gibbs` with its prefix."""
+    # what is no array, such as thinned noise by site, is no statistic
     found = {name: value for name, value in fields.items() if hasattr(value, "shape")}
     for block, path, prefix in _blocks(kernel):
-        own = {
-            name.removeprefix(path): found.pop(name)
-            for name in list(found)
-            if name.startswith(path)
-        }
+        # a list, since the dictionary shrinks
+        chosen = [name for name in list(found) if name.startswith(path)]
+        own = {name.removeprefix(path): found.pop(name) for name in chosen}
         own = {_ARVIZ_NAMES.get(name, name): value for name, value in own.items()}
         if "lp" in own:
-            own["lp"] = -own["lp"]
+            own["lp"] = -own["lp"]  # a potential is minus the log density
         if "n_steps" in own and isinstance(block, NUTS):
+            # a tree of depth d has 2^d − 1 steps, or fewer where it was cut off
             own["tree_depth"] = np.log2(np.asarray(own["n_steps"])).astype(int) + 1
         found |= {prefix + name: value for name, value in own.items()}
     diverging = [np.asarray(value) for name, value in found.items() if name.endswith("_diverging")]
@@ -72,24 +73,20 @@ def statistics(fields: dict[str, Any], kernel) -> dict[str, Any]:
 
 def _fields_of(kernel) -> tuple[str, ...]:
     known = [names for kind, names in _FIELDS.items() if isinstance(kernel, kind)]
-    return (
-        known[0]
-        if known
-        else tuple(name for name in kernel.default_fields if name != kernel.sample_field)
-    )
+    default = tuple(name for name in kernel.default_fields if name != kernel.sample_field)
+    return known[0] if known else default
 
 
 def _blocks(kernel, path="", prefix="") -> list[tuple[Any, str, str]]:
-    """The kernels that make a draw, each with the path of its state and the prefix of its
-    statistics.
-    """
+    """The kernels that make a draw, with the path of its state and the prefix of its names."""
     if not isinstance(kernel, Gibbs):
         return [(kernel, path, prefix)]
     kernels = [block for block, _ in kernel.blocks]
     names = [type(block).__name__.lower() for block in kernels]
+    # two blocks of one kind are told apart by their numbers
     names = [f"{name}{i}" if names.count(name) > 1 else name for i, name in enumerate(names)]
-    return [
-        leaf
-        for i, (block, name) in enumerate(zip(kernels, names, strict=True))
-        for leaf in _blocks(block, f"{path}block_states.{i}.", f"{prefix}{name}_")
-    ]
+    leaves = []
+    for i, (block, name) in enumerate(zip(kernels, names, strict=True)):
+        # a block may be a `Gibbs` itself
+        leaves += _blocks(block, f"{path}block_states.{i}.", f"{prefix}{name}_")
+    return leaves

@@ -24,12 +24,12 @@ def start_step_size(value: Array) -> StepSize:
 
 
 def update_step_size(step: StepSize, shortfall, bounds, *, renew, last) -> StepSize:
-    """After a draw with acceptance `shortfall` below target. `renew`: starts again at the mean;
-    `last`: stays there.
-    """
+    """After a draw `shortfall` below target. `renew`: anew from the mean; `last`: stays there."""
+    # `averaging` has the log of the last step first, and then that of their weighted mean
     averaging = _update(shortfall, step.averaging)
     log_value, log_mean = averaging[:2]
     mean = jnp.clip(jnp.exp(log_mean), *bounds)
     value = jnp.where(renew | last, mean, jnp.clip(jnp.exp(log_value), *bounds))
+    # where the reference was renewed, steps are in other units: the past is forgotten
     again = start_step_size(mean)
     return choose(renew, again, StepSize(value, averaging))

@@ -1,5 +1,6 @@
 """Landmarks and outlines in CSV tables.
- A wide table has one row for a specimen, with columns id, x1, y1, x2, y2, ...; a long one has one
+
+A wide table has one row for a specimen, with columns id, x1, y1, x2, y2, ...; a long one has one
 row for a point, with columns id, point, x, y.
 """
 
@@ -98,6 +99,31 @@ def read_csv(
     **Raises:** `ValueError` with file, line number, what was expected and what was found, for
     anything else.
     """
+    _check_settings(id, point, decimal, dim)
+    codes = missing_codes(missing)
+    table = read_table(path, delimiter, encoding)
+    # what the columns are called decides the layout; with both there would be a choice to make
+    wide = _wide_columns(table)
+    long = _long_columns(table)
+    if wide and long:
+        found = f"those of {list(long.values())[0]!r} and {wide[0]!r}"
+        fail(path, 1, "one set of coordinates", found, _ONE_SET)
+    columns = wide or list(long.values()) or _bare_columns(table)
+    sign = decimal or _decimal_sign(table, columns, codes)
+    # called from here, since it may warn, of the line that calls this function
+    axes = len(long) if long else _num_axes(table, columns, dim)
+    points = _points(table, columns, axes, codes, sign)
+    if wide:
+        specimens = _wide(table, points, columns, id)
+    elif long:
+        specimens = _long(table, points, columns, id, point)
+    else:
+        specimens = [Specimen(np.concatenate(list(points.values())), id=stem(path))]
+    warn_of_codes(path, specimens, "Name the code in `missing` if so.")
+    return specimens
+
+
+def _check_settings(id, point, decimal, dim) -> None:
     for name, value in (("id", id), ("point", point)):
         allowed = isinstance(value, str) or name == "id" and value is None
         require(allowed, f"`{name}` must be the name of a column; got {words(value)}.")
@@ -107,31 +133,6 @@ def read_csv(
     if dim is not None:
         message = f"`dim` must be 2 or 3, or None; got {words(dim)}."
         require(positive_integer(dim, "dim") in (2, 3), message)
-    codes = missing_codes(missing)
-    table = read_table(path, delimiter, encoding)
-    wide = _wide_columns(table, dim)
-    long = _long_columns(table)
-    if wide and long:
-        found = f"those of {list(long.values())[0]!r} and {wide[0]!r}"
-        fail(path, 1, "one set of coordinates", found, _ONE_SET)
-    columns = wide or list(long.values())
-    if not columns:
-        columns = _bare_columns(table)
-    sign = decimal or _decimal_sign(table, columns, codes)
-    axes = len(long) if long and not wide else _num_axes(table, columns, dim)
-    points = {}
-    for row in table.rows:
-        cells = [row.cells[name] for name in columns]
-        values = [number(cell, path, row.line, codes, sign, _CURE) for cell in cells]
-        points[row.line] = np.reshape(values, (-1, axes))
-    if wide:
-        specimens = _wide(table, points, columns, id)
-    elif long:
-        specimens = _long(table, points, columns, id, point)
-    else:
-        specimens = [Specimen(np.concatenate(list(points.values())), id=stem(path))]
-    warn_of_codes(path, specimens, "Name the code in `missing` if so.")
-    return specimens
 
 
 def write_csv(
@@ -161,8 +162,10 @@ def write_csv(
     choice(layout, "layout", ("wide", "long"))
     check_delimiter(delimiter)
     _check_table(specimens, layout)
-    shape, notes = specimens[0].landmarks.shape, list(specimens[0].notes)
+    shape = specimens[0].landmarks.shape
+    notes = list(specimens[0].notes)
     axes = "xyz"[: shape[1]]
+    # numbers as the shortest texts that read back as the same ones
     if layout == "wide":
         header = ["id", *notes, *(f"{axis}{i}" for i in range(1, shape[0] + 1) for axis in axes)]
         rows = [[s.id, *s.notes.values(), *map(text, s.landmarks.ravel())] for s in specimens]
@@ -212,6 +215,7 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
     if delimiter is not None:
         check_delimiter(delimiter)
     content = read_text(path, encoding)
+    # lines above the table, which count for the numbers of lines in messages
     above = re.findall(r"\A(?:(?:sep=.|#.*)\n)*", content.replace("\r\n", "\n"))[0].splitlines()
     content = content.split("\n", len(above))[-1]
     said = [line[4] for line in above if line.startswith("sep=")]  # for a spreadsheet program
@@ -221,55 +225,72 @@ def read_table(path: str | PathLike, delimiter: str | None, encoding: str) -> Ta
     if not records:
         cure = "Write the names of the columns."
         fail(path, 1, "a header such as id,x1,y1,x2,y2", "nothing", cure)
-    began, header = records[0]
-    bare = all(_is_number(cell) for cell in header)
-    if not bare:
-        records = records[1:]
-        header = _without_empty_end(header, 1)
-        if not records:
-            cure = "Export the table again."
-            fail(path, began + 1, "at least one row", "the end of the file", cure)
-    elif above and _has_axes(names := above[-1].lstrip("# ").split(delimiter), len(header)):
-        bare = False  # the header is a comment, as NumPy writes it
-        header = [name.strip() for name in names]
-    else:
-        header = [str(j + 1) for j in range(len(header))]
+    header, records, bare = _header(path, records, above, delimiter)
     records = [(line, _without_empty_end(cells, len(header))) for line, cells in records]
     if not bare and all(len(cells) == len(header) + 1 for _, cells in records):
         header = ["", *header]  # as R writes the names of rows
+    # the first column may lack a name, where it names the rows; others are empty columns
     kept = [j for j, name in enumerate(header) if name or j == 0]
-    for line, cells in records:
-        if len(cells) != len(header):
-            cure = "Quote cells that contain the delimiter; leave missing cells empty."
-            fail(path, line, f"{len(header)} cells as in the header", f"{len(cells)}", cure)
-        for j, cell in enumerate(cells):
-            if cell and j not in kept:
-                expected = f"nothing in column {j + 1}, which has no name"
-                fail(path, line, expected, repr(cell), "Write its name.")
+    _check_cells(path, records, len(header), kept)
     header = [header[j] for j in kept]
-    twice = [name for name, count in Counter(header).items() if count > 1]
-    if twice:
-        fail(path, 1, "different names of columns", f"{twice[0]!r} twice", "Rename one of them.")
-    rows = [
-        Row(line, {name: cells[j] for name, j in zip(header, kept, strict=True)})
-        for line, cells in records
-    ]
+    _check_different(path, header)
+    rows = []
+    for line, cells in records:
+        named = {name: cells[j] for name, j in zip(header, kept, strict=True)}
+        rows.append(Row(line, named))
     return Table(path, header, rows, delimiter, bare)
 
 
-def _records(
-    path: str | PathLike, content: str, delimiter: str, num_above: int
-) -> list[tuple[int, list[str]]]:
-    """Stripped cells of the lines that have any, and the number of their (last) line."""
+_Records = list[tuple[int, list[str]]]
+"""The (last) line of each, and its cells."""
+
+
+def _records(path: str | PathLike, content: str, delimiter: str, num_above: int) -> _Records:
+    """Stripped cells of the lines that have any."""
     reader = _reader(content, delimiter)
+    records = []
     try:
-        records = [
-            (reader.line_num + num_above, [cell.strip() for cell in cells]) for cells in reader
-        ]
+        for cells in reader:
+            # a quoted cell may have line breaks: only the reader knows the line of the file
+            records.append((reader.line_num + num_above, [cell.strip() for cell in cells]))
     except csv.Error as error:
         line = reader.line_num + num_above
         fail(path, line, "cells of a table", f"something else ({error})", "Close all quotes.")
     return [(line, cells) for line, cells in records if any(cells)]
+
+
+def _header(
+    path: str | PathLike, records: _Records, above: list[str], delimiter: str
+) -> tuple[list[str], _Records, bool]:
+    """The names of columns, the records below them, and whether there are no names in the file."""
+    began, first = records[0]
+    if not all(_is_number(cell) for cell in first):
+        if len(records) == 1:
+            cure = "Export the table again."
+            fail(path, began + 1, "at least one row", "the end of the file", cure)
+        return _without_empty_end(first, 1), records[1:], False
+    names = above[-1].lstrip("# ").split(delimiter) if above else []
+    if _has_axes(names, len(first)):  # the header is a comment, as NumPy writes it
+        return [name.strip() for name in names], records, False
+    return [str(j + 1) for j in range(len(first))], records, True
+
+
+def _check_different(path: str | PathLike, header: list[str]) -> None:
+    twice = [name for name, count in Counter(header).items() if count > 1]
+    if twice:
+        fail(path, 1, "different names of columns", f"{twice[0]!r} twice", "Rename one of them.")
+
+
+def _check_cells(path: str | PathLike, records: _Records, count: int, kept: list[int]) -> None:
+    """Refuses lines of other lengths, and cells in columns without a name."""
+    for line, cells in records:
+        if len(cells) != count:
+            cure = "Quote cells that contain the delimiter; leave missing cells empty."
+            fail(path, line, f"{count} cells as in the header", f"{len(cells)}", cure)
+        for j, cell in enumerate(cells):
+            if cell and j not in kept:
+                expected = f"nothing in column {j + 1}, which has no name"
+                fail(path, line, expected, repr(cell), "Write its name.")
 
 
 def _has_axes(names: list[str], count: int) -> bool:
@@ -280,6 +301,7 @@ def _has_axes(names: list[str], count: int) -> bool:
 
 
 def _reader(content: str, delimiter: str):
+    # tables with blanks between cells are aligned by several of them
     blanks = delimiter == " "
     return csv.reader(
         io.StringIO(content, newline=""), delimiter=delimiter, skipinitialspace=blanks
@@ -288,7 +310,7 @@ def _reader(content: str, delimiter: str):
 
 def _delimiter_of(content: str) -> str:
     """The first that divides the first line with content."""
-    start = content[: 1 << 16]
+    start = content[: 1 << 16]  # a file may be large, and its first line is not
     for delimiter in _DELIMITERS:
         for cells in _reader(start, delimiter):
             filled = sum(bool(cell.strip()) for cell in cells)
@@ -311,20 +333,18 @@ def _is_number(cell: str) -> bool:
 
 def _plain(name: str) -> str:
     """A name of a column in lower case, without its unit."""
+    # "x (mm)", but not "x(1)", which is a number
     return re.sub(r"\s*[(\[][^\d)\]]*[)\]]$", "", name.lower())
 
 
-def _wide_columns(table: Table, dim: int | None) -> list[str]:
+_Place = tuple[int, str, str]
+"""Number of the point, axis and name of a column of coordinates; axis "" where it is counted."""
+
+
+def _wide_columns(table: Table) -> list[str]:
     """Those of coordinates, point by point; none if the table is not wide."""
-    sets: dict[tuple[int, str], list[tuple[int, str, str]]] = {}
-    for name in table.header:
-        for form, pattern in enumerate((*_NUMBERED, _COUNTED)):
-            if found := pattern.fullmatch(_plain(name)):
-                parts = found.groupdict()
-                place = (int(parts["number"]), parts.get("axis", ""), name)
-                sets.setdefault((form, parts["set"]), []).append(place)
-                break
-    whole = [places for places in sets.values() if _has_a_point(places)]
+    # a column such as `y2020` beside x and y is no point, and makes no table wide
+    whole = [places for places in _numbered_sets(table) if _has_a_point(places)]
     if not whole:
         whole = _named_points(table)
     if not whole:
@@ -332,16 +352,10 @@ def _wide_columns(table: Table, dim: int | None) -> list[str]:
     if len(whole) > 1:
         found = " and ".join(repr(places[0][2]) for places in whole)
         fail(table.path, 1, "one set of coordinates", f"those of {found}", _ONE_SET)
-    columns = {}
-    for i, axis, name in whole[0]:
-        if (i, axis) in columns:
-            found = f"{columns[i, axis]!r} and {name!r}"
-            fail(
-                table.path, 1, "one column for a coordinate", found, "Rename or delete one of them."
-            )
-        columns[i, axis] = name
+    columns = _by_place(table, whole[0])
     indices = sorted({i for i, _ in columns})
     axes = sorted({axis for _, axis in columns})
+    # from 0 or from 1: a first point that is missing would shift all others
     first = min(indices[0], 1)
     wanted = [(i, axis) for i in range(first, indices[-1] + 1) for axis in axes]
     absent = [place for place in wanted if place not in columns]
@@ -354,13 +368,38 @@ def _wide_columns(table: Table, dim: int | None) -> list[str]:
     return [columns[place] for place in wanted]
 
 
-def _has_a_point(places: list[tuple[int, str, str]]) -> bool:
+def _numbered_sets(table: Table) -> list[list[_Place]]:
+    """Columns with a number in their name, apart by how it is written and what comes before."""
+    sets: dict[tuple[int, str], list[_Place]] = {}
+    for name in table.header:
+        for form, pattern in enumerate((*_NUMBERED, _COUNTED)):
+            if found := pattern.fullmatch(_plain(name)):
+                parts = found.groupdict()
+                place = (int(parts["number"]), parts.get("axis", ""), name)
+                sets.setdefault((form, parts["set"]), []).append(place)
+                break
+    return list(sets.values())
+
+
+def _by_place(table: Table, places: list[_Place]) -> dict[tuple[int, str], str]:
+    """Columns by point and axis, each once."""
+    columns = {}
+    for i, axis, name in places:
+        if (i, axis) in columns:
+            found = f"{columns[i, axis]!r} and {name!r}"
+            cure = "Rename or delete one of them."
+            fail(table.path, 1, "one column for a coordinate", found, cure)
+        columns[i, axis] = name
+    return columns
+
+
+def _has_a_point(places: list[_Place]) -> bool:
     """Whether the columns have x and y of some point."""
     found = {(i, axis) for i, axis, _ in places}
     return any(axis == "" or {(i, "x"), (i, "y")} <= found for i, axis in found)
 
 
-def _named_points(table: Table) -> list[list[tuple[int, str, str]]]:
+def _named_points(table: Table) -> list[list[_Place]]:
     """Columns of at least two points that have names, which are numbered as they come."""
     matches = [(name, _NAMED.fullmatch(_plain(name))) for name in table.header]
     named = [(found["name"], found["axis"], name) for name, found in matches if found]
@@ -368,6 +407,7 @@ def _named_points(table: Table) -> list[list[tuple[int, str, str]]]:
     for point, axis, _ in named:
         axes.setdefault(point, set()).add(axis)
     points = [point for point, has in axes.items() if {"x", "y"} <= has]
+    # one alone may be anything, such as `location_x` and `location_y` of a long table
     if len(points) < 2:
         return []
     return [[(points.index(point), axis, name) for point, axis, name in named if point in points]]
@@ -379,6 +419,7 @@ def _num_axes(table: Table, columns: list[str], dim: int | None) -> int:
     if not counted:
         return 3 if any(re.search(r"z[\s._-]*\d+$|z$", _plain(name)) for name in columns) else 2
     count = len(columns)
+    # by what divides the number of coordinates; both do for multiples of 6, which are told of
     found = dim or (3 if count % 2 and count % 3 == 0 else 2)
     if count % found:
         cure = "Pass `dim`, 2 or 3."
@@ -421,14 +462,14 @@ def _bare_columns(table: Table) -> list[str]:
 
 
 def _decimal_sign(table: Table, columns: list[str], codes: Collection[str | float]) -> str:
-    """A comma where numbers have commas, none has a point, and the commas do not separate
-    thousands."""
+    """A comma where numbers have commas and no points, and these do not separate thousands."""
     every = [row.cells[name] for row in table.rows for name in columns]
     cells = [cell for cell in every if cell.lower() not in codes]
     with_comma = [cell for cell in cells if "," in cell]
     if not with_comma or any("." in cell for cell in cells):
         return "."
     grouped = all(re.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+", cell) for cell in with_comma)
+    # where semicolons divide cells, commas are decimal: so do spreadsheets write both
     return "." if grouped and table.delimiter != ";" else ","
 
 
@@ -445,36 +486,59 @@ _Points = dict[int, np.ndarray]
 """Those of a row, by its line."""
 
 
+def _points(
+    table: Table, columns: list[str], axes: int, codes: Collection[str | float], sign: str
+) -> _Points:
+    points = {}
+    for row in table.rows:
+        cells = [row.cells[name] for name in columns]
+        values = [number(cell, table.path, row.line, codes, sign, _CURE) for cell in cells]
+        points[row.line] = np.reshape(values, (-1, axes))
+    return points
+
+
 def _wide(table: Table, points: _Points, columns: list[str], id: str | None) -> list[Specimen]:
     column = _id_column(table, id)
+    # names of rows, as R writes them, in a column without a name
     if column is None and id is not None and "" in table.header:
         column = ""
     others = [name for name in table.header if name and name not in columns and name != column]
-    return [
-        Specimen(
-            points[row.line],
-            id=None if column is None else row.cells[column] or None,
-            notes={name: row.cells[name] for name in others},
-        )
-        for row in table.rows
-    ]
+    specimens = []
+    for row in table.rows:
+        name = None if column is None else row.cells[column] or None
+        notes = {name: row.cells[name] for name in others}
+        specimens.append(Specimen(points[row.line], id=name, notes=notes))
+    return specimens
 
 
 def _long(
     table: Table, points: _Points, columns: list[str], id: str | None, point: str
 ) -> list[Specimen]:
-    column, order = _id_column(table, id), table.column(point)
+    column = _id_column(table, id)
+    order = table.column(point)
     if order is None and point != "point":
-        fail(
-            table.path,
-            1,
-            f"a column {point!r}",
-            table.listed(),
-            "Pass the `point` column of the file.",
-        )
+        cure = "Pass the `point` column of the file."
+        fail(table.path, 1, f"a column {point!r}", table.listed(), cure)
     others = [name for name in table.header if name and name not in (*columns, column, order)]
     if column is None and id is not None:
         _check_one_specimen(table, others)
+    groups = _grouped(table, column)
+    if order is not None:
+        groups = {name: _in_order(table, group, order) for name, group in groups.items()}
+    else:
+        _check_order(table, groups, others)
+    # others are of points, and a note is of a specimen
+    constant = [name for name in others if _is_constant(name, groups)]
+    specimens = []
+    for name, group in groups.items():
+        landmarks = np.concatenate([points[row.line] for row in group])
+        notes = {key: group[0].cells[key] for key in constant}
+        specimens.append(Specimen(landmarks, id=name, notes=notes))
+    return specimens
+
+
+def _grouped(table: Table, column: str | None) -> dict[str | None, list[Row]]:
+    """Rows by the name of their specimen, which need not be neighbours."""
     groups: dict[str | None, list[Row]] = {}
     for row in table.rows:
         name = None if column is None else row.cells[column]
@@ -482,20 +546,12 @@ def _long(
             cure = "Write the name of the specimen in each row of it."
             fail(table.path, row.line, f"a name in {column!r}", "none", cure)
         groups.setdefault(name, []).append(row)
-    if order is not None:
-        groups = {name: _in_order(table, group, order) for name, group in groups.items()}
-    else:
-        _check_order(table, groups, others)
-    specimens = []
-    for name, group in groups.items():
-        landmarks = np.concatenate([points[row.line] for row in group])
-        notes = {
-            key: group[0].cells[key]
-            for key in others
-            if all(len({row.cells[key] for row in rows}) == 1 for rows in groups.values())
-        }
-        specimens.append(Specimen(landmarks, id=name, notes=notes))
-    return specimens
+    return groups
+
+
+def _is_constant(name: str, groups: dict[str | None, list[Row]]) -> bool:
+    """Whether a column has one text within each specimen."""
+    return all(row.cells[name] == rows[0].cells[name] for rows in groups.values() for row in rows)
 
 
 def _check_one_specimen(table: Table, others: list[str]) -> None:
@@ -503,22 +559,15 @@ def _check_one_specimen(table: Table, others: list[str]) -> None:
 
     They hold every value twice or more.
     """
-    repeated = [
-        name for name in others if min(Counter(row.cells[name] for row in table.rows).values()) > 1
-    ]
+    counts = {name: Counter(row.cells[name] for row in table.rows) for name in others}
+    repeated = [name for name, count in counts.items() if min(count.values()) > 1]
     if repeated:
-        listed = ", ".join(map(repr, repeated))
+        found = f"no column id, but {', '.join(map(repr, repeated))}"
         cure = (
             f"Pass `id={repeated[0]!r}` if that names the specimens, or `id=None` if all rows are "
             "points of one."
         )
-        fail(
-            table.path,
-            1,
-            "a column 'id' that names the specimens",
-            f"no column id, but {listed}",
-            cure,
-        )
+        fail(table.path, 1, "a column 'id' that names the specimens", found, cure)
 
 
 def _check_order(table: Table, groups: dict[str | None, list[Row]], others: list[str]) -> None:
@@ -529,9 +578,12 @@ def _check_order(table: Table, groups: dict[str | None, list[Row]], others: list
     """
     longest = max(map(len, groups.values()))
     for name in others:
-        seen = {id: [row.cells[name] for row in group] for id, group in groups.items()}
+        seen = {}
+        for id, group in groups.items():
+            seen[id] = [row.cells[name] for row in group]
         every = {value for values in seen.values() for value in values}
         labels = all(len(set(values)) == len(values) for values in seen.values())
+        # a column of measurements has other values in every specimen, and says nothing of points
         if not labels or longest < 2 or len(every) > 1.5 * longest:
             continue
         first, *rest = seen.items()
@@ -541,11 +593,11 @@ def _check_order(table: Table, groups: dict[str | None, list[Row]], others: list
                     f"Pass `point={name!r}` if that numbers the points, or sort the rows and add "
                     "NA for missing points."
                 )
-                one, other = ", ".join(first[1][:6]), ", ".join(values[:6])
+                one = ", ".join(first[1][:6])
+                other = ", ".join(values[:6])
                 found = f"{one} for {first[0]!r} and {other} for {id!r}"
-                fail(
-                    table.path, groups[id][0].line, f"one order of points in {name!r}", found, cure
-                )
+                expected = f"one order of points in {name!r}"
+                fail(table.path, groups[id][0].line, expected, found, cure)
 
 
 def _in_order(table: Table, group: list[Row], point: str) -> list[Row]:
@@ -560,6 +612,7 @@ def _in_order(table: Table, group: list[Row], point: str) -> list[Row]:
             fail(table.path, row.line, f"a whole number in {point!r}", repr(cell), cure)
         numbered.append((int(cell), row.line, row))
     numbered.sort(key=lambda entry: entry[:2])
+    # from 0 or 1 on, each number once: a gap would pair other points than those that correspond
     for expected, (found, line, _) in enumerate(numbered, start=min(numbered[0][0], 1)):
         if found != expected:
             fail(table.path, line, f"point {expected} next", f"point {found}", cure)

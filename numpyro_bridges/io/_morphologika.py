@@ -62,12 +62,13 @@ def read_morphologika(
     """
     codes = missing_codes(missing)
     sections = _sections(path, read_lines(path, encoding))
-    count, num_points, dim = (
-        _whole_number(path, sections, name) for name in ("individuals", "landmarks", "dimensions")
-    )
+    count = _whole_number(path, sections, "individuals")
+    num_points = _whole_number(path, sections, "landmarks")
+    dim = _whole_number(path, sections, "dimensions")
     names: list[str | None] = [None] * count
     if sections.get("names"):
         names = [line for _, line in _exactly(path, sections, "names", count)]
+    # a line before each specimen has its name again, behind a quote: it may be left out
     points = [line for line in sections["rawpoints"] if line[1][0] not in "'\"#"]
     rows = _exactly(path, sections | {"rawpoints": points}, "rawpoints", count * num_points)
     values = []
@@ -126,23 +127,42 @@ def _whole_number(path: str | PathLike, sections: dict[str, _Lines], name: str) 
 
 def _notes(path: str | PathLike, sections: dict[str, _Lines], count: int) -> list[dict[str, str]]:
     """Labels, and the group, of each specimen."""
+    notes = _labels(path, sections, count)
+    for note, group in zip(notes, _groups(path, sections, count), strict=False):
+        note["group"] = group
+    return notes
+
+
+def _labels(path: str | PathLike, sections: dict[str, _Lines], count: int) -> list[dict[str, str]]:
+    """The values of each specimen, by label."""
     notes: list[dict[str, str]] = [{} for _ in range(count)]
-    labels = [label for _, line in sections.get("labels", []) for label in line.split()]
-    if labels and "labelvalues" in sections:
-        values = _exactly(path, sections, "labelvalues", count)
-        for note, (line, value) in zip(notes, values, strict=True):
-            parts = value.split() if len(labels) > 1 else [value]
-            if len(parts) != len(labels):
-                cure = "Write each without blanks."
-                fail(path, line, f"{len(labels)} values of labels", repr(value), cure)
-            note |= dict(zip(labels, parts, strict=True))
-    words = [word for _, line in sections.get("groups", []) for word in line.split()]
+    labels = _words(sections, "labels")
+    if not labels or "labelvalues" not in sections:
+        return notes
+    values = _exactly(path, sections, "labelvalues", count)
+    for note, (line, value) in zip(notes, values, strict=True):
+        # of a single label the value may have blanks
+        parts = value.split() if len(labels) > 1 else [value]
+        if len(parts) != len(labels):
+            cure = "Write each without blanks."
+            fail(path, line, f"{len(labels)} values of labels", repr(value), cure)
+        note |= dict(zip(labels, parts, strict=True))
+    return notes
+
+
+def _groups(path: str | PathLike, sections: dict[str, _Lines], count: int) -> list[str]:
+    """The group of each specimen, of which the file has names and sizes in turn; none without."""
+    words = _words(sections, "groups")
     sizes = [int(word) if word.isdecimal() else 0 for word in words[1::2]]
     if words and (len(words) % 2 or sum(sizes) != count):
         cure = "It says the name and the size of each group."
         line = sections["groups"][0][0]
         fail(path, line, f"[groups] of {count} specimens in all", repr(" ".join(words)), cure)
-    in_groups = [name for name, size in zip(words[::2], sizes, strict=True) for _ in range(size)]
-    for i, name in enumerate(in_groups):
-        notes[i]["group"] = name
-    return notes
+    groups = []
+    for name, size in zip(words[::2], sizes, strict=True):
+        groups += [name] * size
+    return groups
+
+
+def _words(sections: dict[str, _Lines], name: str) -> list[str]:
+    return [word for _, line in sections.get(name, []) for word in line.split()]

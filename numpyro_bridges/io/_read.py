@@ -30,6 +30,7 @@ def read(path: str | PathLike, *, encoding: str = "utf-8", **settings) -> list[S
     **Returns:** a list of `Specimen`.
     """
     content = read_text(path, encoding)
+    # without DIM= an NTS file looks like a table of numbers: its name decides
     by_name = as_path(path, "path").name.lower().removesuffix(".gz").endswith((".nts", ".dta"))
     found = [reader for pattern, reader in _READERS.items() if re.search(pattern, content)]
     reader = read_nts if by_name else (found or [read_csv])[0]

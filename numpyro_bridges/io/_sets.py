@@ -41,6 +41,7 @@ def stack(specimens: Iterable[Specimen], *, points: str = "all") -> Stack:
     """
     specimens = as_specimens(specimens)
     choice(points, "points", ("all", "landmarks", "curves"))
+    # compared by what would be said of them: specimens that differ can then be told so
     kinds = [_kind(specimen, points) for specimen in specimens]
     (usual, how_many), *_ = Counter(kinds).most_common(1)
     odd = [i for i, kind in enumerate(kinds) if kind != usual]
@@ -113,7 +114,7 @@ def join(
     if delimiter is not None:
         check_delimiter(delimiter)
     check_encoding(encoding)
-    if hasattr(table, "columns"):
+    if hasattr(table, "columns"):  # a data frame; pandas need not be installed
         header = [str(name) for name in table.columns]
         rows = [
             dict(zip(header, map(_as_text, row), strict=True))
@@ -135,23 +136,23 @@ def join(
     )
     chosen = _in_order(specimens, rows) if column is None else _by_name(specimens, rows, column, of)
     kept = [name for name in header if name and name != column]
-    return [
-        dataclasses.replace(
-            specimen, notes=_together(specimens, i, {name: row[name] for name in kept})
-        )
-        for i, (specimen, row) in enumerate(zip(specimens, chosen, strict=True))
-    ]
+    joined = []
+    for i, row in enumerate(chosen):
+        notes = _together(specimens, i, {name: row[name] for name in kept})
+        joined.append(dataclasses.replace(specimens[i], notes=notes))
+    return joined
 
 
 def _column(header: Sequence[str], by: str | None) -> str | None:
+    # by the rule of a file's table, whatever the case
     return None if by is None else Table("", list(header), [], ",", False).column(by)
 
 
 def _as_text(value: Any) -> str:
-    """A cell of pandas: whole numbers that it made floats are whole again, and what is missing is
-    nothing."""
-    if value is None or value != value:
+    """A cell of pandas: numbers that it made floats are whole again, the missing are empty."""
+    if value is None or value != value:  # NaN, of whatever type
         return ""
+    # a column of integers with one missing is of floats in pandas: 7.0 was 7
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
@@ -175,6 +176,7 @@ def _by_name(
             twice.append(name)
         named[name] = row
     names = [_name(specimens, i, of) for i in range(len(specimens))]
+    # rows of others are left out, however often they come
     twice = [name for name in twice if name in names]
     require(
         not twice,
@@ -210,6 +212,7 @@ def _name(specimens: list[Specimen], i: int, of: str) -> str:
 
 def _together(specimens: list[Specimen], i: int, more: dict[str, str]) -> dict[str, str]:
     notes = dict(specimens[i].notes)
+    # neither of two texts is taken for the other; the same text twice is no matter
     differ = [key for key, value in more.items() if notes.get(key, value) != value]
     require(
         not differ,

@@ -10,6 +10,7 @@ import numpy as np
 from ._specimen import Specimen, fail, number, read_text, stem
 
 _CURVES = ("Curve", "ClosedCurve", "Line")
+# in words in JSON, as numbers in `.fcsv`
 _DEFINED = ("defined", "2")
 _STATES = ("undefined", "preview", "missing", "0", "1", "3", *_DEFINED)
 _COLUMNS: tuple[str, ...] = (
@@ -48,6 +49,7 @@ def read_slicer(path: str | PathLike, *, encoding: str = "utf-8") -> list[Specim
 def _from_json(path: str | PathLike, content: str) -> Specimen:
     try:
         markups = json.loads(content)["markups"]
+        # LPS is the default of the format
         lists = [(m["type"], m.get("coordinateSystem", "LPS"), m["controlPoints"]) for m in markups]
     except json.JSONDecodeError as error:
         fail(path, error.lineno, "JSON", f"something else ({error.msg})", "Save the markups again.")
@@ -95,6 +97,7 @@ def _is_defined(path: str | PathLike, line: int, state: str) -> bool:
 
 def _from_fcsv(path: str | PathLike, content: str) -> Specimen:
     lines = re.split("\r\n?|\n", content)
+    # lines of comment hold settings, the names of the columns among them
     said = {}
     for line in lines:
         if line.startswith("#"):
@@ -104,28 +107,28 @@ def _from_fcsv(path: str | PathLike, content: str) -> Specimen:
     if not {"x", "y", "z"} <= set(columns):
         fail(path, 1, "columns x, y, z", ",".join(columns), "Save the markups again.")
     if columns == list(_COLUMNS[:14]):
-        columns = list(_COLUMNS)
-    landmarks, labels = [], []
+        columns = list(_COLUMNS)  # see there
+    landmarks = []
+    labels = []
     for i, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
             continue
+        # by `csv`, since a label may have commas within quotes; versions differ in how many cells
         cells = dict(zip(columns, next(csv.reader([line])), strict=False))
         if "z" not in cells:
             fail(path, i, "a point with x, y, z", repr(line), "Save the markups again.")
         defined = _is_defined(path, i, cells.get("positionstatus", "").strip() or "defined")
-        position = (
-            [number(cells[axis].strip(), path, i) for axis in "xyz"] if defined else [np.nan] * 3
-        )
+        position = [np.nan] * 3  # what stands there has no meaning
+        if defined:
+            position = [number(cells[axis].strip(), path, i) for axis in "xyz"]
         landmarks.append(position)
         labels.append(cells.get("label", ""))
     if not landmarks:
-        fail(
-            path, len(lines), "at least one point", "the end of the file", "Save the markups again."
-        )
+        cure = "Save the markups again."
+        fail(path, len(lines), "at least one point", "the end of the file", cure)
     system = str(said.get("coordinatesystem", "0"))
-    return Specimen(
-        np.array(landmarks), id=stem(path), notes=_notes(str(_SYSTEMS.get(system, system)), labels)
-    )
+    notes = _notes(str(_SYSTEMS.get(system, system)), labels)
+    return Specimen(np.array(landmarks), id=stem(path), notes=notes)
 
 
 def _notes(system: str, labels: list[str]) -> dict[str, str]:

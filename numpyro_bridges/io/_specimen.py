@@ -59,6 +59,7 @@ class Specimen:
             f"`curves` must be a tuple of arrays (n, d); got {words(self.curves)}.",
         )
         curves = tuple(known_float(curve, f"curves[{j}]") for j, curve in enumerate(self.curves))
+        # a frozen dataclass sets its own fields so
         object.__setattr__(self, "curves", curves)
         object.__setattr__(self, "landmarks", known_float(self.landmarks, "landmarks"))
         if self.scale is not None:
@@ -88,8 +89,7 @@ class Specimen:
 
 
 def open_text(path: str | PathLike, encoding: str) -> TextIO:
-    """A text file to write, compressed where its name ends in `.gz`; line ends are written as they
-    are."""
+    """A text file to write, compressed where its name ends in `.gz`; line ends stay as they are."""
     path = as_path(path, "path")
     check_encoding(encoding)
     if fspath(path).endswith(".gz"):
@@ -113,6 +113,7 @@ def read_text(path: str | PathLike, encoding: str) -> str:
     """
     path = as_path(path, "path")
     check_encoding(encoding)
+    # told by its first bytes, whatever the name says
     content = path.read_bytes()
     if content.startswith(b"\x1f\x8b"):
         content = _decompressed(path, content)
@@ -134,6 +135,7 @@ def read_text(path: str | PathLike, encoding: str) -> str:
             f"{path}: expected text in the encoding {encoding!r}, found byte "
             f"{error.object[error.start]:#04x}. {cure}"
         ) from error
+    # UTF-16 without a mark decodes as UTF-8: every other byte of Latin text is 0
     order = "le" if content[1:2] == b"\0" else "be"
     require(
         "\0" not in found,
@@ -158,8 +160,7 @@ def read_lines(path: str | PathLike, encoding: str) -> list[str]:
 
 
 def stem(path: str | PathLike) -> str:
-    """The name of a file without its endings: what a specimen is called that has a file to
-    itself."""
+    """The name of a file without its endings, which a specimen has that is alone in it."""
     return re.sub(r"(?i)(\.mrk)?\.\w+(\.gz)?$", "", Path(path).name)
 
 
@@ -192,18 +193,20 @@ def number(
     """A finite number, or NaN for one of the codes of a missing value, texts in lower case."""
     if token.lower() in missing:
         return np.nan
+    # not by the locale, which is the reader's and not the file's
     try:
         value = float(token.replace(decimal, "."))
     except ValueError:
         value = np.inf
+    # 1_000 is a number to Python; a point is none where numbers have commas
     if not np.isfinite(value) or "_" in token or decimal != "." and "." in token:
         fail(path, line, "a finite number", repr(token), cure)
+    # codes again, as numbers: -999 and -999.0 are one
     return np.nan if value in missing else value
 
 
 def missing_codes(missing: str | float | Iterable[str | float]) -> frozenset[str | float]:
-    """Codes that a user names, and the usual texts: as texts, and those that are numbers as
-    numbers."""
+    """Codes that a user names, as texts and where possible as numbers, and the usual texts."""
     listed = isinstance(missing, Iterable) and not isinstance(missing, (str, bytes))
     codes: set[str | float] = set(NOT_AVAILABLE)
     for code in list(missing) if listed else [missing]:  # type: ignore[arg-type]
@@ -229,6 +232,7 @@ def warn_of_codes(path: str | PathLike, specimens: list[Specimen], cure: str) ->
     suspects = []
     for i, specimen in enumerate(specimens):
         points = specimen.landmarks
+        # (-1, -1) among positive ones, or (999, 999) among any
         same = np.all(points == points[:, :1], axis=1)
         negative = same & np.all(points < 0, axis=1)
         others = points[~negative & np.isfinite(points).all(axis=1)]

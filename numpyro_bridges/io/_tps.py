@@ -96,12 +96,12 @@ def write_tps(
 
 
 class _Lines:
-    """The lines with content: `current` is the next one, `None` at the end, and `number` its
-    number."""
+    """The lines with content: `current`, the next one (`None` at the end), and its `number`."""
 
     def __init__(self, path: str | PathLike, every: list[str]):
         self.path = path
         keys = [_key(line) for line in every]
+        # a comment above the first specimen may be any text
         first = next((i for i, key in enumerate(keys) if key in _BLOCKS), 0)
         if any(key in _RESERVED or _is_row(every[i]) for i, key in enumerate(keys[:first])):
             first = 0  # more than a comment: the first specimen says what is wrong
@@ -131,6 +131,7 @@ def _key(line: str) -> str:
 
 
 def _is_comment(line: str) -> bool:
+    # "#ID=a" would be a key; so a comment has no =
     return line.startswith("#") and "=" not in line
 
 
@@ -147,11 +148,22 @@ def _specimen(lines: _Lines, negative_is_missing: bool) -> Specimen:
             "LM=, LM3= or POINTS= only, as many as these say."
         )
         lines.fail("LM= or LM3=", cure)
-    dim, began = _BLOCKS[key], lines.number
+    dim = _BLOCKS[key]
+    began = lines.number
     landmarks = _rows(lines, key, _count(lines), dim)
     if negative_is_missing:
         landmarks[(landmarks < 0.0).any(axis=1)] = np.nan
+    curves, fields, notes = _entries(lines, dim, began)
+    named = {_FIELDS[key]: value for key, value in fields.items()}
+    # outlines after curves, in whatever order the file has them
+    every = [curve for key in _LINES for curve in curves.get(key, ())]
+    return Specimen(landmarks, tuple(every), notes=notes, **named)
 
+
+def _entries(
+    lines: _Lines, dim: int, began: int
+) -> tuple[dict[str, list[NDArray]], dict, dict[str, str]]:
+    """What stands between the landmarks and the next specimen: curves, fields and notes by key."""
     curves: dict[str, list[NDArray]] = {}
     fields: dict = {}
     notes: dict[str, str] = {}
@@ -163,7 +175,8 @@ def _specimen(lines: _Lines, negative_is_missing: bool) -> Specimen:
             )
         if key in _LINES:
             curves[key] = list(_curves(lines, key, dim))
-            continue
+            continue  # it has gone on to the line after its last point
+        # a block more than CURVES= says
         if key == "POINTS":
             lines.fail(
                 "CURVES= before POINTS=", "CURVES= gives the number of POINTS= blocks: correct it."
@@ -175,9 +188,7 @@ def _specimen(lines: _Lines, negative_is_missing: bool) -> Specimen:
         else:
             notes[key] = f"{notes[key]}\n{value}" if key in notes else value
         lines.advance()
-    named = {_FIELDS[key]: value for key, value in fields.items()}
-    every = [curve for key in _LINES for curve in curves.get(key, ())]
-    return Specimen(landmarks, tuple(every), notes=notes, **named)
+    return curves, fields, notes
 
 
 def _scale(lines: _Lines, value: str) -> float | None:
@@ -240,21 +251,19 @@ def _format(specimen: Specimen) -> Iterator[str]:
     if specimen.scale is not None:
         yield f"SCALE={float(specimen.scale)!r}"
     for key, value in specimen.notes.items():
-        if (
-            not re.fullmatch(r"[^\s=]([^\n\r=]*[^\s=])?", key)
-            or key != key.upper()
-            or key in _RESERVED
-        ):
+        one_line = re.fullmatch(r"[^\s=]([^\n\r=]*[^\s=])?", key)
+        if not one_line or key != key.upper() or key in _RESERVED:
             raise ValueError(
                 f"`notes` has the key {key!r}: use upper case, and no key that has a meaning in "
                 "the format."
             )
+        # a key that comes twice is read as a text of two lines
         for line in value.split("\n"):
             yield f"{key}={_one_line(line, 'notes')}"
 
 
 def _number_lines(points: NDArray) -> Iterator[str]:
-    return (" ".join(text(value) for value in row) for row in points)
+    return (" ".join(map(text, row)) for row in points)
 
 
 def _one_line(value: str, name: str) -> str:

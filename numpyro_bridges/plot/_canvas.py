@@ -7,10 +7,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._checks import as_path, known_float, require, words
 
-START, TARGET, ACCENT, NEUTRAL = "#003f5c", "#d55e00", "#0072b2", "#8a8a8a"
+START = "#003f5c"
+TARGET = "#d55e00"
+ACCENT = "#0072b2"
+NEUTRAL = "#8a8a8a"
 
 
 def pyplot() -> Any:
+    # here, since matplotlib need not be installed
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:
@@ -38,6 +42,7 @@ def shape_axes(ax: Any, points: NDArray, size: float = 5.0) -> Any:
     if ax is None:
         extent = np.ptp(seen(points), axis=0)
         longest = extent.max()
+        # a single point has no proportions, and a straight line would be a figure of no height
         proportions = extent / longest if 0 < longest < np.inf else np.ones(2)
         figsize = size * np.maximum(proportions, 0.05) + 0.3
         _, ax = plt.subplots(figsize=tuple(figsize), layout="constrained")
@@ -59,6 +64,7 @@ def polygons(shapes: NDArray, closed: bool, **kwargs: Any) -> Any:
 def draw(ax: Any, shapes: NDArray, closed: bool, **kwargs: Any) -> Any:
     """Polygons on axes, which grow to hold them."""
     lines = polygons(shapes, closed, **kwargs)
+    # limits by the points that are not missing
     ax.add_collection(lines, autolim=False)
     ax.update_datalim(seen(shapes))
     ax.autoscale_view()

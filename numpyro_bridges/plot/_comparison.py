@@ -1,6 +1,4 @@
-"""Log evidences of one estimand by several bridges, with their effective sample sizes and their
-cost.
-"""
+"""Log evidences of one estimand by several bridges, with effective sample sizes and cost."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +11,8 @@ from ._canvas import ACCENT, NEUTRAL, START, as_file, pyplot
 
 def draw_comparison(rows: Mapping[str, Mapping[str, float | bool]], path: Any) -> Any:
     """The rows of a `Comparison` as three panels, written to a file; the `Figure`, closed."""
-    plt, path = pyplot(), as_file(path, "path")
+    plt = pyplot()
+    path = as_file(path, "path")
     size = (8.0, 1.0 + 0.42 * len(rows))
     figure, axes = plt.subplots(
         1, 3, figsize=size, sharey=True, layout="constrained", width_ratios=[1.4, 1, 1.2]
@@ -30,19 +29,16 @@ def draw_comparison(rows: Mapping[str, Mapping[str, float | bool]], path: Any) -
         axes[0], column("log_evidence"), column("standard_error"), column("trusted") > 0, colors
     )
     _bars(axes[1], 100 * column("ess_fraction"), colors, "ESS, %")
-    run, total = (column("seconds_per_effective_sample" + end) for end in ("", "_with_training"))
+    run = column("seconds_per_effective_sample")
+    total = column("seconds_per_effective_sample_with_training")
     trained = bool(np.any(total > run))
+    # the longer bars first, in a pale colour: those of the run cover their beginnings
     if trained:
         axes[2].barh(range(len(rows)), _finite(total), height=0.5, color=ACCENT, alpha=0.35)
-    _bars(
-        axes[2],
-        run,
-        colors,
-        "seconds per effective sample" + trained * "\n(pale: with training)",
-        total,
-    )
+    label = "seconds per effective sample" + trained * "\n(pale: with training)"
+    _bars(axes[2], run, colors, label, total)
     axes[0].set_yticks(range(len(rows)), list(rows))
-    axes[0].set_ylim(len(rows) - 0.4, -0.6)
+    axes[0].set_ylim(len(rows) - 0.4, -0.6)  # the first row at the top
     figure.savefig(path, dpi=150)
     plt.close(figure)
     return figure
@@ -54,9 +50,9 @@ def _evidences(ax, values: NDArray, errors: NDArray, trusted: NDArray, colors: l
             error = 2 * errors[i] if np.isfinite(errors[i]) else None
             ax.errorbar(values[i], i, xerr=error, color=color, marker="o", markersize=4, capsize=3)
         if not trusted[i]:
-            words = (
-                "not to be trusted" if np.isfinite(values[i]) else f"{values[i]}, not to be trusted"
-            )
+            # where there is no point to be grey, the value is said
+            value = "" if np.isfinite(values[i]) else f"{values[i]}, "
+            words = f"{value}not to be trusted"
             place = {"xycoords": ("axes fraction", "data"), "ha": "left", "va": "bottom"}
             ax.annotate(words, (0.02, i - 0.12), fontsize=7, color=NEUTRAL, **place)
     ax.set_xlabel("log evidence ± 2 SE", fontsize=9)
@@ -66,9 +62,7 @@ def _evidences(ax, values: NDArray, errors: NDArray, trusted: NDArray, colors: l
 def _bars(
     ax, values: NDArray, colors: list[str], label: str, totals: NDArray | None = None
 ) -> None:
-    """Horizontal bars with their numbers instead of an axis; what is not finite has a number and no
-    bar.
-    """
+    """Horizontal bars with numbers in place of an axis; what is not finite has no bar."""
     totals = values if totals is None else totals
     ax.barh(range(len(values)), _finite(values), height=0.5, color=colors)
     for i, (value, total) in enumerate(zip(values, totals, strict=True)):

@@ -58,10 +58,14 @@ def deformation(
     num_lines = positive_integer(num_lines, "num_lines", least=2)
     margin = known_number(margin, "margin", "a number from 0 on", lambda value: value >= 0)
     closed = flag(closed, "closed")
-    first, last = (np.asarray(flow.space.to_points(path[i])) for i in (0, -1))
-    low, high = first.min(axis=0), first.max(axis=0)
+    first = np.asarray(flow.space.to_points(path[0]))
+    last = np.asarray(flow.space.to_points(path[-1]))
+    low = first.min(axis=0)
+    high = first.max(axis=0)
     size = (high - low).max()
-    low, high = low - margin * size, high + margin * size
+    low = low - margin * size
+    high = high + margin * size
+    # square cells, of which the shorter side has fewer; lines are curves between their crossings
     counts = np.maximum(np.ceil(num_lines * (high - low) / (high - low).max()).astype(int), 2)
     sides = [np.linspace(low[i], high[i], _PER_CELL * (counts[i] - 1) + 1) for i in range(2)]
     points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
@@ -69,6 +73,7 @@ def deformation(
     carried = np.asarray(carried).reshape(points.shape)
     stretched = np.asarray(stretched).reshape(points.shape[:2])
     area = np.log2(stretched, out=np.full(stretched.shape, np.nan), where=stretched > 0)
+    # symmetric limits, so that the middle of the colours stands for no change
     most = np.nanmax(np.abs(area)) if np.isfinite(area).any() else 0.0
     ax = shape_axes(ax, np.concatenate([carried.reshape(-1, 2), first, last]))
     limits = {"vmin": -max(most, 1e-3), "vmax": max(most, 1e-3)}

@@ -32,14 +32,8 @@ def outlines(
     style: dict[str, Any] = {"alpha": _opacity(len(shapes))} | kwargs
     lines = draw(ax, shapes, closed, colors=color, linewidths=linewidth, **style)
     if mean is not None:
-        draw(
-            ax,
-            as_points(mean, "mean", "(n, 2)")[None],
-            closed,
-            colors=START,
-            linewidths=2.0,
-            zorder=3,
-        )
+        mean = as_points(mean, "mean", "(n, 2)")
+        draw(ax, mean[None], closed, colors=START, linewidths=2.0, zorder=3)
     return lines
 
 
@@ -72,18 +66,19 @@ def path(
     """
     path = as_points(path, "path", "(K + 1, n, 2)")
     times = as_times(ts, len(path))
-    closed, trajectories = flag(closed, "closed"), flag(trajectories, "trajectories")
+    closed = flag(closed, "closed")
+    trajectories = flag(trajectories, "trajectories")
     num_outlines = positive_integer(num_outlines, "num_outlines")
     ax = shape_axes(ax, path)
     if trajectories:
-        draw(
-            ax, path.transpose(1, 0, 2), False, colors=NEUTRAL, linewidths=0.5, alpha=0.5, zorder=1
-        )
+        ways = path.transpose(1, 0, 2)  # a polygon for each point
+        draw(ax, ways, False, colors=NEUTRAL, linewidths=0.5, alpha=0.5, zorder=1)
+    # each once, where there are fewer states than outlines
     chosen = np.unique(np.linspace(0, len(path) - 1, num_outlines).round().astype(int))
     widths = np.where(np.isin(chosen, (0, len(path) - 1)), 2.2, 1.0)
-    lines = draw(
-        ax, path[chosen], closed, linewidths=widths, cmap=cmap or time_map(), zorder=2, **kwargs
-    )
+    cmap = cmap or time_map()
+    lines = draw(ax, path[chosen], closed, linewidths=widths, cmap=cmap, zorder=2, **kwargs)
+    # colours by times, whatever the steps of the grid
     lines.set_array(times[chosen])
     lines.set_clim(times[0], times[-1])
     return lines
@@ -121,15 +116,19 @@ def bridge_fan(
     **Returns:** one `LineCollection` of outlines for each frame.
     """
     max_outlines = positive_integer(max_outlines, "max_outlines")
-    num_frames, closed = positive_integer(num_frames, "num_frames"), flag(closed, "closed")
+    num_frames = positive_integer(num_frames, "num_frames")
+    closed = flag(closed, "closed")
     choice(direction, "direction", ("row", "column"))
     paths = as_points(paths, "paths", "(S, K + 1, n, 2)")[:max_outlines]
-    start, target = as_points(start, "start", "(n, 2)"), as_points(target, "target", "(n, 2)")
+    start = as_points(start, "start", "(n, 2)")
+    target = as_points(target, "target", "(n, 2)")
     times = as_times(ts, paths.shape[1])
     wanted = np.linspace(times[0], times[-1], num_frames)
     chosen = [int(np.abs(times - time).argmin()) for time in wanted]
+    # all frames are on the same axes, each shifted by the box around all that is drawn in any
     corners = np.concatenate([seen(paths[:, chosen]), seen(start), seen(target)])
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
     step = (high - low) * ([1.12, 0.0] if direction == "row" else [0.0, -1.25])
     strip = np.stack([low, high]) + step * np.arange(num_frames)[:, None, None]
     ax = shape_axes(ax, strip, size=(2.2 if direction == "row" else 1.6) * num_frames)
@@ -139,32 +138,18 @@ def bridge_fan(
     for frame, index in enumerate(chosen):
         shift = frame * step
         fan = {"colors": [colors[frame]], "linewidths": 0.8, "alpha": _opacity(len(paths))}
-        first, last = frame == 0, frame == num_frames - 1
+        first = frame == 0
+        last = frame == num_frames - 1
         drawn.append(draw(ax, paths[:, index] + shift, closed, **fan))
-        draw(
-            ax,
-            (start + shift)[None],
-            closed,
-            colors=START,
-            linewidths=2.2 if first else 0.9,
-            zorder=3,
-        )
-        dashes = "-" if last else (0, (4, 2))
+        width = 2.2 if first else 0.9
+        draw(ax, (start + shift)[None], closed, colors=START, linewidths=width, zorder=3)
         width = 2.2 if last else 0.9
-        draw(
-            ax,
-            (target + shift)[None],
-            closed,
-            colors=TARGET,
-            linewidths=width,
-            linestyles=dashes,
-            zorder=4,
-        )
+        dashed = {"linestyles": "-" if last else (0, (4, 2)), "zorder": 4}
+        draw(ax, (target + shift)[None], closed, colors=TARGET, linewidths=width, **dashed)
         below = ((low[0] + high[0]) / 2.0 + shift[0], low[1] + shift[1])
         label = f"$t = {times[index]:.2g}$"
-        ax.annotate(
-            label, below, (0, -5), textcoords="offset points", ha="center", va="top", fontsize=9
-        )
+        style: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 9}
+        ax.annotate(label, below, (0, -5), textcoords="offset points", **style)
     return drawn
 
 
@@ -190,7 +175,8 @@ def score_field(
 
     **Returns:** the `Quiver`.
     """
-    points, arrows = as_points(points, "points", "(n, 2)"), as_points(arrows, "arrows", "(n, 2)")
+    points = as_points(points, "points", "(n, 2)")
+    arrows = as_points(arrows, "arrows", "(n, 2)")
     if arrows.shape != points.shape:
         raise ValueError(
             f"`arrows` must have the shape of `points` {points.shape}, got {arrows.shape}."
@@ -204,8 +190,10 @@ def score_field(
     ax = shape_axes(ax, np.concatenate([points, points + drawn]))
     draw(ax, points[None], closed, colors=NEUTRAL, linewidths=1.2, zorder=1)
     ax.plot(*points.T, linestyle="none", marker="o", markersize=2.5, color=START, zorder=2)
+    # matplotlib counts the feet of arrows for the limits, and not the tips
     ax.update_datalim(points + drawn)
     ax.autoscale_view()
+    # in the units of the points: matplotlib scales arrows by the axes otherwise
     settings = dict(
         angles="xy", scale_units="xy", scale=1.0, width=0.0045, headwidth=3.5, headlength=4.5
     )

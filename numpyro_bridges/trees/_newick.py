@@ -16,15 +16,14 @@ import numpy as np
 
 from .._checks import as_path, positive_integer, require, words
 
+# quotes come first: a bracket within them is part of a name; '' within them is a quote
 _QUOTED_OR_COMMENT = re.compile(r"'(?:[^']|'')*'|\[[^\]]*\]")
 _UNROOTED = re.compile(r"(?im)^(\s*)utree\b")
 _TWO_LENGTHS = re.compile(r":[^,();:]*(:)")
 
 
 class Parsed(NamedTuple):
-    """Nodes in preorder; the parent of the root is −1, and the length of its edge `None` where none
-    is written.
-    """
+    """Nodes in preorder; the root's parent is −1, a length `None` where none is written."""
 
     parents: list[int]
     lengths: list[float | None]
@@ -32,9 +31,7 @@ class Parsed(NamedTuple):
 
 
 def text_of(source: str | PathLike) -> str:
-    """Text as it is, the content of a file by its path. Newick text has a parenthesis or a
-    semicolon.
-    """
+    """Text as it is (it has a parenthesis or a semicolon), the content of a file by its path."""
     if isinstance(source, str) and re.search(r"[(;]", source):
         return source
     return as_path(source, "source").read_text(encoding="utf-8-sig")
@@ -47,6 +44,7 @@ def parse(source: str | PathLike, index: int | None, preserve_underscores: bool)
     text = _without_comments(text)
     if not _is_nexus(text) and not text.rstrip().endswith(";"):
         text = text.rstrip() + ";"  # a file may end without
+    # a colon within quotes belongs to a name
     found = _TWO_LENGTHS.search(_hidden_quotes(text))
     require(
         found is None,
@@ -81,17 +79,21 @@ def _hidden_quotes(text: str) -> str:
 
 
 def _position(text: str, found: re.Match | None) -> str:
+    # group 1 is the second colon; line and column count from 1
     before = text[: found.start(1)] if found else ""
     return f"line {before.count(chr(10)) + 1}, column {len(before) - before.rfind(chr(10))}"
 
 
 def _read(text: str, place: str, preserve_underscores: bool) -> Any:
+    # here, since most programs read no tree
     import dendropy
 
     nexus = _is_nexus(text)
     if nexus:  # PAML writes rooted trees so; DendroPy does not know the word
         text = _UNROOTED.sub(r"\1 tree", text)
+    # names of inner nodes stay labels, where several nodes may have the support 95
     settings = dict(preserve_underscores=preserve_underscores, suppress_internal_node_taxa=True)
+    # a tree without the mark [&R] would be unrooted to DendroPy
     settings |= dict(rooting="force-rooted")
     if not nexus:  # names that are given twice are ours to refuse
         settings |= dict(suppress_leaf_node_taxa=True)
@@ -110,7 +112,8 @@ def _is_nexus(text: str) -> bool:
 
 
 def _nodes(tree: Any) -> Parsed:
-    parsed, number = Parsed([], [], []), {}
+    parsed = Parsed([], [], [])
+    number = {}
     for node in tree.preorder_node_iter():
         number[node] = len(number)
         parsed.parents.append(-1 if node.parent_node is None else number[node.parent_node])
@@ -128,10 +131,9 @@ def _name(node: Any) -> str | None:
 
 
 def _is_support(label: str) -> bool:
-    """Inner nodes carry bootstrap and posterior supports, `95` or `0.98/100`, where a name would
-    be.
-    """
+    """Inner nodes may have supports, `95` or `0.98/100`, where a name would be."""
     try:
+        # `inf` and `nan` are numbers to Python, and may be the names of clades
         return bool(np.all([np.isfinite(float(part)) for part in label.split("/")]))
     except ValueError:
         return False

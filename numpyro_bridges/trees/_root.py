@@ -43,11 +43,13 @@ class Root(eqx.Module):
     @classmethod
     def of(cls, x0: State, covariance: Structured | None) -> "Root":
         """Near x0."""
+        # the derivative of a factorisation holds for symmetric matrices, and C may be a parameter
         factor = None if covariance is None else cholesky(symmetric(covariance).astype(x0.dtype))
         return cls(x0, factor, x0)
 
     def num_rows(self, k: int) -> int:
         """Rows of k noises each that the root takes."""
+        # ⌈n / k⌉: n numbers for each column, in rows as long as those of the steps
         return 0 if self.factor is None else -(-self.x0.shape[0] // k)
 
     def prior(self, noise: Float[Array, "rows k *dim"]) -> State:
@@ -63,9 +65,9 @@ class Root(eqx.Module):
         N, pull, _ = self._solved(message)
         z = self._used(noise)
         u = solve_lower(N, pull + z, transposed=True)
-        log_ratio = (
-            0.5 * jnp.sum(z * z) - 0.5 * jnp.sum(u * u) - columns(u) * log_diagonal(N, len(u))
-        )
+        # log prior −½ |u|², log posterior −½ |z|² + log|N|, for each column
+        difference = 0.5 * jnp.sum(z * z) - 0.5 * jnp.sum(u * u)
+        log_ratio = difference - columns(u) * log_diagonal(N, len(u))
         return self.x0 + apply(self.factor, u), log_ratio
 
     def noise_of(
@@ -76,7 +78,9 @@ class Root(eqx.Module):
         if self.factor is None:
             return free
         N, pull, _ = self._solved(message)
+        # `posterior` solved for z
         z = N.T @ solve_lower(self.factor, x - self.x0) - pull
+        # the last row may be longer than what is left of z: its rest keeps free draws
         return free.reshape(-1, *x.shape[1:]).at[: len(z)].set(z).reshape(free.shape)
 
     def log_evidence(self, message: Message) -> Float[Array, ""]:
@@ -84,6 +88,7 @@ class Root(eqx.Module):
         if self.factor is None:
             return message[2]  # the anchor is x0
         N, pull, c = self._solved(message)
+        # ∫ N(u; 0, I) exp(c + Fᵀu − ½ uᵀHu) du = exp(c + ½ |N⁻¹F|²) / |N|
         return c + 0.5 * jnp.sum(pull * pull) - columns(pull) * log_diagonal(N, len(pull))
 
     def _used(self, noise) -> State:
@@ -92,8 +97,10 @@ class Root(eqx.Module):
     def _solved(self, message: Message) -> Message:
         """N, N⁻¹F and c of the message as a function of u."""
         H, F, c = message
-        K, d = self.factor, self.x0 - self.anchor
+        K = self.factor
+        d = self.x0 - self.anchor
         assert K is not None
+        # a displacement from the anchor is d + K u: KᵀHK, Kᵀ(F − Hd) and c + Fᵀd − ½ dᵀHd
         N = cholesky(jnp.eye(len(H), dtype=H.dtype) + congruence(transpose(K), H))
         pull = solve_lower(N, apply(transpose(K), F - H @ d))
         return N, pull, c + jnp.sum(F * d) - 0.5 * jnp.sum(d * (H @ d))

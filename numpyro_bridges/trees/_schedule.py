@@ -12,15 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+# places of a round, all of which are computed, and held in memory, at once
 _MAX_WIDTH = 32
 _MAX_IDLE = 0.5
 """Places of rounds that are left empty, relative to those that are taken."""
 
 
 class Schedule(NamedTuple):
-    """Static numbers. *Ends* are nodes on which nothing that is seen hangs any more, *inner* ones
-    the others.
-    """
+    """Static numbers. *Ends* are nodes below which nothing is seen, *inner* nodes the others."""
 
     ends: tuple[int, ...]
     """Nodes at the ends, in preorder."""
@@ -41,27 +40,31 @@ class Schedule(NamedTuple):
     """For each node of `inner` where its parent's state is kept; that of the root is in slot 0."""
 
     def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """`rounds` as an array, a place of no node holding the round's first once more, and which
-        of them are nodes.
-        """
+        """`rounds` as an array, padded with the first of each round, and which are nodes."""
         width = max(map(len, self.rounds), default=1)
+        # a place of no node repeats a real one: it computes finite numbers, which are not used
         filled = [nodes + nodes[:1] * (width - len(nodes)) for nodes in self.rounds]
-        taken = [[i < len(nodes) for i in range(width)] for nodes in self.rounds]
-        return np.array(filled, int).reshape(-1, width), np.array(taken, bool).reshape(-1, width)
+        lengths = np.array([len(nodes) for nodes in self.rounds], int)
+        taken = np.arange(width) < lengths[:, None]
+        # reshaped for a tree without inner nodes, which has no round
+        return np.array(filled, int).reshape(-1, width), taken
 
 
 def schedule(parents: Sequence[int], observed: Sequence[int]) -> Schedule:
     """The schedule of a tree in preorder."""
-    count, above = len(parents), np.array(parents)
+    count = len(parents)
+    above = np.array(parents)
     needed = np.zeros(count, bool)
     needed[list(observed)] = True
     size = np.ones(count, int)
+    # in preorder a node comes after its parent: backwards, a subtree is complete at its root
     for node in range(count - 1, 0, -1):
         needed[above[node]] |= needed[node]
         size[above[node]] += size[node]
     active = np.array([node for node in range(1, count) if needed[node]], int)
     has_child = np.isin(np.arange(count), above[active])
     ends = active[~has_child[active]]
+    # inner ones only: branches to ends need no order, and are walked all at once
     children: dict[int, list[int]] = {node: [] for node in range(count)}
     for node in active[has_child[active]]:
         children[int(above[node])].append(int(node))
@@ -69,44 +72,55 @@ def schedule(parents: Sequence[int], observed: Sequence[int]) -> Schedule:
     rounds = _rounds(_heavy_last(children, size), parents)
     order = [node for nodes in rounds for node in nodes]
     place = {node: i for i, node in enumerate(order)}
+    places = [tuple(map(place.__getitem__, nodes)) for nodes in rounds]
     slot_of, num_slots = _slots(rounds, parents, children)
     return Schedule(
         tuple(ends.tolist()),
         tuple(order),
         tuple(active.tolist()),
-        tuple(tuple(place[node] for node in nodes) for nodes in rounds),
+        tuple(places),
         num_slots,
+        # `num_slots` is no place: states have none there, messages one that stays 0
         tuple(slot_of.get(node, num_slots) for node in order),
+        # a place is used again only after its readers, so it is the parent's when it is read
         tuple(slot_of[parents[node]] for node in order),
     )
 
 
 def _heavy_last(children: dict[int, list[int]], size: np.ndarray) -> list[int]:
-    order, waiting = [], [0]
+    """Inner nodes depth first, of siblings that with the largest subtree last."""
+    order = []
+    waiting = [0]
     while waiting:
         node = waiting.pop()
         if node:
             order.append(node)
+        # the last of the stack is the next: the largest goes to its bottom
         waiting.extend(sorted(children[node], key=lambda child: -size[child]))
     return order
 
 
 def _rounds(order: Sequence[int], parents: Sequence[int]) -> list[list[int]]:
     """Nodes that are walked together: as many as can be without many empty places."""
-    width, rounds = 1, [[node] for node in order]
+    width = 1
+    rounds = [[node] for node in order]
     while 2 * width <= _MAX_WIDTH:
         wider = _rounds_of(2 * width, order, parents)
+        # a chain has one node in each round: wider ones would only repeat it
         if 2 * width * len(wider) > (1 + _MAX_IDLE) * len(order):
             break
-        width, rounds = 2 * width, wider
+        width *= 2
+        rounds = wider
     return rounds
 
 
 def _rounds_of(width: int, order: Sequence[int], parents: Sequence[int]) -> list[list[int]]:
     """Each node in the first round after its parent's that has a place."""
-    round_of, rounds = {0: -1}, []
+    round_of = {0: -1}
+    rounds = []
     first_free = 0
     for node in order:
+        # its parent's state must have been written
         number = max(round_of[parents[node]] + 1, first_free)
         while number < len(rounds) and len(rounds[number]) == width:
             number += 1
@@ -120,12 +134,13 @@ def _rounds_of(width: int, order: Sequence[int], parents: Sequence[int]) -> list
 
 
 def _slots(rounds, parents, children) -> tuple[dict[int, int], int]:
-    """For each node that has inner children a place until they have read it. A round reads before
-    it writes.
-    """
-    slot_of, taken, free = {0: 0}, 1, []
+    """For each node with inner children a place until these have read it."""
+    slot_of = {0: 0}
+    taken = 1
+    free = []
     remaining = {node: len(own) for node, own in children.items()}
     for nodes in rounds:
+        # a round reads all before it writes, so that its own parents' places can be used again
         for node in nodes:
             parent = parents[node]
             remaining[parent] -= 1

@@ -110,9 +110,11 @@ class TreeProblem(eqx.Module):
         """
         x0 = root.x0
         guide = default_guide(sde, x0) if guide is None else guide
+        # a node of several rows has one condition, in which they are fused
         observed = tuple(dict.fromkeys(tree.observed))
         walk = schedule(tree.parents, observed)
         above = np.array(tree.parents[1:])
+        # every branch counts its own time from 0, which keeps the digits of its steps
         clock = jnp.zeros_like(tree.lengths)
         if not sde.is_autonomous(x0):
             clock = t0 + tree.depths[above]
@@ -122,23 +124,22 @@ class TreeProblem(eqx.Module):
         return cls(sde, guide, root, branches, conditions, tree.parents, observed, num_steps, walk)
 
     def anchored(self, t0) -> "TreeProblem":
-        """With anchors where a Brownian motion would be, given the data, for processes and guides
-        that need some.
-        """
+        """With anchors, where they are needed, at the mean of a Brownian motion given the data."""
+        # a linear process is the same near every state; a guide that follows is told of means
         if self.sde.has_exact_transition or self.follows:
             return self
-        walker, own = self._walker(None, t0), self.branches.own
+        walker = self._walker(None, t0)
+        own = self.branches.own
         own = None if own is None else jax.vmap(lambda own: self._walker(own, t0))(own)
         branches = self.branches._replace(own=own)
+        # Gaussian and exact with one step a branch: without noise, paths pass through the means
         rough = replace(self, sde=walker, guide=FrozenGuide(), num_steps=1, branches=branches)
         active = np.array(self.schedule.active)
         still = jnp.zeros((rough.num_noises, *self.x0.shape), self.x0.dtype)
         paths, _ = rough.down(rough.up(), still)
-        anchors = (
-            jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape))
-            .at[active]
-            .set(paths[:, -1])
-        )
+        # nodes without data keep the root's: no path goes there
+        anchors = jnp.broadcast_to(self.x0, (len(self.parents), *self.x0.shape))
+        anchors = anchors.at[active].set(paths[:, -1])
         anchors = anchors.at[0].set(paths[0, 0])
         above = np.array(self.parents[1:])
         branches = self.branches._replace(anchor=anchors[1:], parent_anchor=anchors[above])
@@ -148,6 +149,7 @@ class TreeProblem(eqx.Module):
         """As fast as a branch's process is at the root."""
         a = self._sde_of(own).covariance(t0, self.x0)
         variance = jnp.mean(jnp.diagonal(a)) if a.ndim == 2 else jnp.mean(a)
+        # any speed puts the anchors somewhere between the data; 0 would be a singular covariance
         return BrownianMotion(jnp.where(variance > 0, variance, 1.0), space=self.sde.space)
 
     @property
@@ -167,11 +169,11 @@ class TreeProblem(eqx.Module):
 
     @property
     def follows(self) -> bool:
-        """Whether what is seen below a node is told by a mean, for the guide's covariances to
-        follow the state.
-        """
+        """Whether a node's data are told by a mean, for the guide's covariances to follow."""
+        # κ is a time under one covariance, and branches with SDEs of their own have several
         if self.branches.own is not None:
             return False
+        # a static property, which is the same for all branches and conditions
         branch = jax.tree.map(lambda a: a[0], self.branches)
         seen = jax.tree.map(lambda a: a[0], self.conditions).observation(self.sde, self.x0)
         return self.guide.follows(self._edge(branch), seen, jnp.zeros_like(self.x0))
@@ -186,6 +188,7 @@ class TreeProblem(eqx.Module):
     def log_weight(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, ""]:
         """Ψ."""
         up = self.up()
+        # where Ψ depends on no noise the way down would add its rounding and its time
         return self.log_evidence(up) if self.is_exact else jnp.sum(self.down(up, noise)[1])
 
     @full_precision
@@ -197,21 +200,24 @@ class TreeProblem(eqx.Module):
         up = self.up()
         if self.is_exact:
             blocks = len(self.schedule.active) + (self.num_root_rows > 0)
+            # one term has it all, so that the sum has no rounding
             return jnp.zeros((blocks,), self.x0.dtype).at[0].set(self.log_evidence(up))
         return self.down(up, noise)[1]
 
     @full_precision
     def log_likelihoods(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, " seen"]:
-        """For each seen node what its datum is given its state, or, at an end, the terms of what
-        leads to it alone.
-        """
-        schedule, place = self.schedule, {node: i for i, node in enumerate(self.schedule.active)}
+        """For each seen node log p(v | x), or, at an end, the terms of what leads to it alone."""
+        schedule = self.schedule
+        place = {node: i for i, node in enumerate(schedule.active)}
         at_inner = np.array([place[node] for node in schedule.inner], int)
         paths, log_weights = self.down(self.up(), noise)
-        densities = self._log_density_inside(jnp.concatenate([paths[:1, 0], paths[at_inner, -1]]))
+        states = jnp.concatenate([paths[:1, 0], paths[at_inner, -1]])
+        densities = self._log_density_inside(states)
         by_node = jnp.zeros((len(self.parents),), self.x0.dtype)
         ends = self._leads_to(schedule.active)
+        # behind the term of the root, where it has one
         by_node = by_node.at[ends].add(log_weights[-len(ends) :])
+        # what leads to an inner node leads on to others: of it the density of the datum alone
         by_node = by_node.at[np.array((0, *schedule.inner))].set(densities)
         return by_node[np.array(self.observed)]
 
@@ -219,9 +225,11 @@ class TreeProblem(eqx.Module):
         """For each active node the last one below it to which nothing but its branch leads."""
         last = {}
         above = Counter(self.parents[node] for node in nodes)
+        # backwards, so that a node knows what is below it
         for node in reversed(nodes):
             last.setdefault(node, node)
             parent = self.parents[node]
+            # a node without data and with one branch below it is a mere division of that
             if above[parent] == 1 and parent not in self.observed:
                 last[parent] = last[node]
         return np.array([last[node] for node in nodes])
@@ -231,8 +239,10 @@ class TreeProblem(eqx.Module):
         """Times since its start of every branch that has noise, in preorder."""
         nodes = np.array(self.schedule.active)
         lengths = self.branches.length[nodes - 1]
+        # only ends are pinned, and with an exact condition all of them
         exact = np.isin(nodes, self.schedule.ends) & self.conditions.exact
-        graded, plain = (jax.vmap(lambda t, g=g: self._grid(t, g))(lengths) for g in (True, False))
+        graded = jax.vmap(lambda t: self._grid(t, True))(lengths)
+        plain = jax.vmap(lambda t: self._grid(t, False))(lengths)
         return jnp.where(exact[:, None], graded, plain)
 
     @full_precision
@@ -241,9 +251,7 @@ class TreeProblem(eqx.Module):
         return self.down(self.up(), noise)[0]
 
     def at_nodes(self, paths: Float[Array, "branches K+1 n *dim"]) -> Float[Array, "nodes n *dim"]:
-        """The states of all nodes, from those along the branches; NaN for nodes that lead to
-        nothing seen.
-        """
+        """The states of all nodes, from those along branches; NaN where nothing seen is below."""
         states = jnp.full((len(self.parents), *self.x0.shape), jnp.nan, paths.dtype)
         root = paths[0, 0]  # the first branch, in preorder, starts there
         return states.at[np.array(self.schedule.active)].set(paths[:, -1]).at[0].set(root)
@@ -251,7 +259,9 @@ class TreeProblem(eqx.Module):
     @full_precision
     def noise_from_paths(self, paths, key: PRNGKeyArray) -> Float[Array, "steps k *dim"]:
         """The noise with `paths(noise) = paths`; what they leave free is drawn with the key."""
-        up, walk = self.up(), self.schedule
+        # paths are known, so that all branches of a kind are one `vmap`, with no order among them
+        up = self.up()
+        walk = self.schedule
         place = {node: i for i, node in enumerate(walk.active)}
 
         def inner(branch, plan, w, path, key):
@@ -261,12 +271,14 @@ class TreeProblem(eqx.Module):
         def end(led, branch, path, key):
             plan, seen, observed, ts = led
             y = path - branch.anchor
+            # the path's own end: the datum less the anchor may differ from it by rounding
             observed = apply(seen.operator, y[-1]) if seen.exact else observed
             return retrace_reach(self._edge(branch), plan, seen, ts, y, observed, key)
 
         key_root, key = jr.split(key)
         keys = jr.split(key, len(walk.active))
-        at_inner, at_ends = ([place[node] for node in nodes] for nodes in (walk.inner, walk.ends))
+        at_inner = [place[node] for node in walk.inner]
+        at_ends = [place[node] for node in walk.ends]
         own, others = (_picked((paths, keys), rows) for rows in (at_inner, at_ends))
         z = jax.vmap(end)(up.ends, self._of(walk.ends), *others)
         noise = jnp.zeros((len(walk.active), *z.shape[1:]), z.dtype).at[np.array(at_ends)].set(z)
@@ -281,13 +293,16 @@ class TreeProblem(eqx.Module):
     def simulate(self, noise: Float[Array, "steps k *dim"]) -> Float[Array, "branches K+1 n *dim"]:
         """Unconditioned paths along every branch that has noise, in preorder."""
         walk = self.schedule
-        at_root, noise = noise[: self.num_root_rows], noise[self.num_root_rows :]
+        at_root = noise[: self.num_root_rows]
+        noise = noise[self.num_root_rows :]
         noise = noise.reshape(len(walk.active), self.num_steps, *noise.shape[1:])
         states = jnp.broadcast_to(self.root.prior(at_root), (len(self.parents), *self.x0.shape))
 
+        # branch after branch in preorder: simulation is rare, and needs no schedule
         def step(states, inputs):
             node, parent, branch, is_end, z = inputs
-            x, edge = states[parent], self._edge(branch)
+            x = states[parent]
+            edge = self._edge(branch)
             ts = jnp.where(
                 is_end,
                 self._grid(branch.length, self.conditions.exact),
@@ -311,6 +326,7 @@ class TreeProblem(eqx.Module):
 
     def _grid(self, length, graded: bool):
         s = np.linspace(0.0, 1.0, self.num_steps + 1)
+        # steps shrink towards an end that is pinned, where the guiding drift grows
         s = s * (2 - s) if graded else s
         return length * jnp.asarray(s, self.x0.dtype)
 
@@ -333,16 +349,16 @@ class TreeProblem(eqx.Module):
         return self.sde if own is None else eqx.combine(own, self.sde)
 
     def _inner_grid(self, branch: Branch) -> Array:
-        """Times with an entry of a plan at the end too: the last step to an inner node is led like
-        the others.
-        """
+        """Times that give a plan an entry at the end too: there the last step is led as well."""
         ts = self._grid(branch.length, False)
         return jnp.concatenate([ts, ts[-1:]])
 
     def _inner_plan(
         self, branch: Branch, seen: Observation, observed: State, reference: State, *beyond
     ):
-        edge, ts = self._edge(branch), self._inner_grid(branch)
+        edge = self._edge(branch)
+        ts = self._inner_grid(branch)
+        # known before any message, see `_with_steps`
         if branch.steps is not None:
             assert isinstance(self.guide, FrozenGuide)
             return self.guide.plan(edge, seen, reference, ts, branch.steps)
@@ -356,19 +372,19 @@ class TreeProblem(eqx.Module):
         return self.guide.prepared(self._edge(branch), seen, observed, reference, ts, start)
 
     def _with_steps(self, branches: Branch) -> Branch:
-        """Inner branches with all that can be known before any message, in one program for all of
-        them.
-        """
+        """Inner branches with what is known before any message, in one program for all."""
         guide = self.guide
+        # other guides have no such steps, and rounds linearise where the messages lead
         if not isinstance(guide, FrozenGuide) or guide.rounds:
             return branches
         here = jnp.zeros_like(self.x0)
 
         def of(branch):
             steps = guide.steps(self._edge(branch), here, self._grid(branch.length, False))
-            one, n = jnp.ones((), here.dtype), len(here)
+            one = jnp.ones((), here.dtype)
+            n = len(here)
             operator = promote(one, steps.operator.ndim - 1, n)
-            # the end is in no time
+            # from the end to the end, the last two times of `_inner_grid`: nothing moves
             still = AffineStep(operator, here, promote(0 * one, steps.covariance.ndim - 1, n))
             return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), steps, still)
 
@@ -377,7 +393,10 @@ class TreeProblem(eqx.Module):
 
     def _start_message(self, plan, branch: Branch, observed: State) -> Information:
         """What the branch tells its parent, as a displacement from the parent's anchor."""
+        # the plan's entry at the branch's start has all of the branch before it
         entry = jax.tree.map(lambda a: a[0], plan.steps)
+        # the branch's states are displacements from its own anchor: y = between + y_parent, so
+        # that v − (L y + s) = v − (L y_parent + s + L between)
         between = branch.parent_anchor - branch.anchor
         zero = jnp.zeros((), self.x0.dtype)
         message = plan.message(entry, self._edge(branch), zero, between, observed)
@@ -389,8 +408,10 @@ class TreeProblem(eqx.Module):
 
     def _seen(self, condition: AbstractCondition, anchor: State) -> tuple[Observation, State]:
         """What is seen of a node, a displacement from its anchor."""
+        # of a node's own SDE an observation needs the space only, which all have in common
         seen = condition.observation(self.sde, self.x0)
         displaced = condition.displaced(apply(seen.operator, anchor))
+        # a condition that is no set leads to its datum, whatever the law and the noise
         extra = jnp.zeros((0,), self.x0.dtype)
         return seen, displaced.target(self.x0, jnp.ones((), self.x0.dtype), extra).value
 
@@ -398,6 +419,7 @@ class TreeProblem(eqx.Module):
         seen, observed = self._seen(condition, branch.anchor)
         ts = self._grid(branch.length, condition.exact)
         here = jnp.zeros_like(self.x0)
+        # without anchors of its own a guide that follows is linearised at the datum
         reference = lift(seen.operator, here, observed) if self.follows else here
         guide = self._prepared(branch, seen, observed, reference, ts)
         plan = guide.plan(self._edge(branch), seen, reference, ts)
@@ -413,65 +435,68 @@ class TreeProblem(eqx.Module):
 
         def of_end(led, branch):
             message = self._start_message(led.plan, branch, led.observed)
+            # a plan is of N(v; L x, Σ): constants of the condition are added here
             return message._replace(c=message.c + led.seen.log_scale)
 
         def of_node(condition, anchor):
             seen, observed = self._seen(condition, anchor)
+            # `DiffusionTree` refuses exact data of inner nodes: the 0 is never used
             factor = seen.factor if seen.factor is not None else jnp.zeros((), self.x0.dtype)
             return Information.told_by(seen, observed, factor, self.x0)
 
         def joined(total, branch):
+            # the sum at a node, as an observation of it, is what its branch is led by
             seen, w, c = total.as_observation()
             plan = self._inner_plan(branch, seen, w, jnp.zeros_like(self.x0))
             message = self._start_message(plan, branch, w)
             return message._replace(c=message.c + c), (plan, w)
 
-        own = self._own_messages(jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
-        at_root, (plans, data) = self._summed_up(
-            own, joined, self._with_steps(self._of(self.schedule.inner))
-        )
+        messages = jax.vmap(of_end)(ends, self._of(self.schedule.ends))
+        own = self._own_messages(messages, of_node)
+        inner = self._with_steps(self._of(self.schedule.inner))
+        at_root, (plans, data) = self._summed_up(own, joined, inner)
         return UpwardPass(plans, data, ends, at_root)
 
     def _up_with_means(self, ends: Led) -> UpwardPass:
-        """Each branch by the mean of what is seen below, of whatever covariance the process has
-        there.
-        """
+        """Each branch by the mean of what is seen below, whatever the covariance there."""
         first = jax.tree.map(lambda a: a[0], self.branches)
         zero = jnp.zeros((), self.x0.dtype)
+        # a₀, of all branches: that of the process at the root, where all anchors are
         part = Part.of(*self._edge(first).noise(zero, jnp.zeros_like(self.x0)))
+        like = part.of_state(self.x0)
 
         def of_end(led, branch):
-            return told_by(
-                part.seen(led.seen), led.observed, branch.length, part.a, part.of_state(self.x0)
-            )
+            return told_by(part.seen(led.seen), led.observed, branch.length, part.a, like)
 
         def of_node(condition, anchor):
             seen, observed = self._seen(condition, anchor)
-            return told_by(part.seen(seen), observed, zero, part.a, part.of_state(self.x0))
+            return told_by(part.seen(seen), observed, zero, part.a, like)
 
         def joined(total, branch):
             return earlier(total, branch.length, part.a), total
 
         def led(total, branch):
             seen, value, beyond, reference = as_seen(total, part.a, everything)
-            return self._inner_plan(
-                branch, part.known(seen), value, part.lifted(reference), beyond
-            ), value
+            seen = part.known(seen)
+            reference = part.lifted(reference)
+            return self._inner_plan(branch, seen, value, reference, beyond), value
 
         # for each end the identity, or fewer directions than ever are seen
         everything = ends.seen.operator.ndim == 1 or part.basis is not None
         inner = self._of(self.schedule.inner)
-        own = self._own_messages(jax.vmap(of_end)(ends, self._of(self.schedule.ends)), of_node)
+        messages = jax.vmap(of_end)(ends, self._of(self.schedule.ends))
+        own = self._own_messages(messages, of_node)
         at_root, totals = self._summed_up(own, joined, inner)
+        # the way up needs no plan, so that all are made at once, outside of the loop
         plans, data = jax.vmap(led)(totals, inner)
         return UpwardPass(plans, data, ends, part.message(at_root.information))
 
     def _own_messages(self, messages, of_node):
-        """For each node of the tree what is told by what is seen of it and by the ends that hang on
-        it.
-        """
-        schedule, count = self.schedule, len(self.parents)
+        """For each node what is told by its own data and by the ends that hang on it."""
+        schedule = self.schedule
+        count = len(self.parents)
         above = np.array(self.parents)[list(schedule.ends)]
+        # products of messages are sums of H, F and c; those of one parent add up at its place
         totals = jax.tree.map(
             lambda a: jnp.zeros((count, *a.shape[1:]), a.dtype).at[above].add(a), messages
         )
@@ -490,6 +515,7 @@ class TreeProblem(eqx.Module):
         """
         schedule = self.schedule
         places, taken = schedule.places()
+        # a place more, always 0, is read by nodes on which nothing inner hangs
         kept = jax.tree.map(
             lambda a: jnp.zeros((schedule.num_slots + 1, *a.shape[1:]), a.dtype), own
         )
@@ -503,6 +529,8 @@ class TreeProblem(eqx.Module):
             is_read = jnp.zeros((schedule.num_slots + 1,), bool).at[slot].set(True)
 
             def renewed(a: Array, b: Array) -> Array:
+                # emptied first: what a node of the round has read may be the place of another's
+                # parent
                 unread = jnp.where(rows(is_read, a), 0.0, a)
                 return unread.at[parent_slot].add(jnp.where(rows(taken, b), b, 0.0))
 
@@ -511,13 +539,13 @@ class TreeProblem(eqx.Module):
         slots = np.array(schedule.slot, int), np.array(schedule.parent_slot, int)
         of_inner = _picked(own, schedule.inner), branches, *slots
         inputs = *_picked(of_inner, places), taken
+        # one loop over rounds, whose program does not grow with the tree; up is down reversed
         kept, out = jax.lax.scan(step, kept, inputs, reverse=True)
+        # place 0 is that of the root
         return jax.tree.map(lambda a, b: a[0] + b[0], own, kept), _picked_out(out, schedule)
 
     def log_evidence(self, up: UpwardPass) -> Float[Array, ""]:
-        """The message at the root under its prior: the log likelihood itself where the process is
-        linear.
-        """
+        """The message at the root under its prior: the log likelihood where all is linear."""
         return self.root.log_evidence(up.at_root)
 
     def down(self, up: UpwardPass, noise: Float[Array, "steps k *dim"]):
@@ -526,12 +554,15 @@ class TreeProblem(eqx.Module):
 
         Blocks are the branches, behind the root where it varies.
         """
-        schedule, K = self.schedule, self.num_steps
+        schedule = self.schedule
+        K = self.num_steps
         place = {node: i for i, node in enumerate(schedule.active)}
-        at_root, noise = noise[: self.num_root_rows], noise[self.num_root_rows :]
+        at_root = noise[: self.num_root_rows]
+        noise = noise[self.num_root_rows :]
         root, root_weight = self.root.posterior(up.at_root, at_root)
         noise = noise.reshape(len(schedule.active), K, *noise.shape[1:])
-        inner, ends = schedule.inner, schedule.ends
+        inner = schedule.inner
+        ends = schedule.ends
         at_inner = np.array([place[node] for node in inner], int)
         at_ends = np.array([place[node] for node in ends], int)
         places, taken = schedule.places()
@@ -549,16 +580,17 @@ class TreeProblem(eqx.Module):
             states = states.at[slot].set(path[:, -1], mode="drop", unique_indices=True)
             return states, (path, log_weight)
 
+        # first the inner branches, in rounds: each starts where the one above it has ended
         of_inner = self._of(inner), up.plans, up.data, noise[at_inner]
-        slot, parent_slot = (
-            np.array(schedule.slot, int)[places],
-            np.array(schedule.parent_slot, int)[places],
-        )
-        # a place each, behind the last slot
+        slot = np.array(schedule.slot, int)[places]
+        parent_slot = np.array(schedule.parent_slot, int)[places]
+        # behind the last slot, where JAX drops what is written; a place each, since they must
+        # differ for `unique_indices`
         nowhere = schedule.num_slots + np.arange(places.shape[1])
         slot = np.where(taken & (slot < schedule.num_slots), slot, nowhere)
         _, out = jax.lax.scan(step, states, (_picked(of_inner, places), slot, parent_slot))
         inner_paths, inner_weights = _picked_out(out, schedule)
+        # then the branches to ends, of which nothing hangs: all at once
         known = jnp.concatenate([root[None], inner_paths[:, -1]])
         number = {0: 0} | {node: i + 1 for i, node in enumerate(inner)}
         starts = known[np.array([number[self.parents[node]] for node in ends])]
@@ -572,10 +604,12 @@ class TreeProblem(eqx.Module):
 
         end_paths, end_weights = jax.vmap(end)(up.ends, self._of(ends), starts, noise[at_ends])
         if self.conditions.is_approximated:
+            # a path is led by a Gaussian approximation, and weighed by what is seen
             correction = jax.vmap(lambda condition, x: condition.correction(self.sde, x))
             end_weights = end_weights + correction(self._rows(ends), end_paths[:, -1])
         paths = jnp.zeros((len(schedule.active), K + 1, *self.x0.shape), self.x0.dtype)
         paths = paths.at[at_ends].set(end_paths).at[at_inner].set(inner_paths)
+        # `reach` has weighed the data of ends; those of other nodes are added to their branch
         densities = self._log_density_inside(known)
         log_weights = jnp.zeros((len(schedule.active),), self.x0.dtype).at[at_ends].set(end_weights)
         log_weights = log_weights.at[at_inner].set(inner_weights + densities[1:])
@@ -584,15 +618,14 @@ class TreeProblem(eqx.Module):
         return paths, log_weights
 
     def _log_density_inside(self, states):
-        """Log density of what is seen at the root and at inner nodes, given their states; 0 where
-        nothing is.
-        """
+        """Log density of the data of the root and inner nodes given the states; 0 without data."""
         inner = (0, *self.schedule.inner)
         chosen = [i for i, node in enumerate(inner) if node in self.observed]
         if not chosen:
             return jnp.zeros((len(inner),), self.x0.dtype)
 
         def one(condition, x):
+            # the law of what is seen of x: mean L x, and the error of observation
             seen = condition.observation(self.sde, x)
             log_density = condition.log_value(apply(seen.operator, x), seen.factor) + seen.log_scale
             return log_density + condition.correction(self.sde, x)
@@ -610,5 +643,6 @@ def _picked(tree, rows):
 def _picked_out(by_round, schedule: Schedule):
     """For each inner node what its round gave, in the order of the schedule."""
     places, taken = schedule.places()
+    # where in the flattened rounds the nodes are, by their number in `inner`
     at = np.flatnonzero(taken)[np.argsort(places[taken])]
     return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[at], by_round)

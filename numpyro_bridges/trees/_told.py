@@ -52,6 +52,7 @@ class Part(NamedTuple):
         """For a process with this σ and a."""
         if not are_few(sigma, len(sigma) if sigma.ndim else 0):
             return cls(None, a)
+        # σ = Q R with Q (n, k) of orthonormal columns, so that a = Q (R Rᵀ) Qᵀ
         Q, R = jnp.linalg.qr(sigma)
         return cls(Q.T, R @ R.T)
 
@@ -63,6 +64,7 @@ class Part(NamedTuple):
         """What is seen of a state, of y."""
         if self.basis is None:
             return seen
+        # L x with x = Qᵀ y
         return Observation(compose(seen.operator, self.basis.T), seen.factor, seen.log_scale)
 
     def known(self, seen: Observation) -> Observation:
@@ -94,10 +96,13 @@ class Told(NamedTuple):
 
 def told_by(seen: Observation, observed: State, time: Array, a: Structured, like: State) -> Told:
     """What an observation tells of the state a time before, which is like this."""
+    # the message of a Brownian motion of covariance a₀: Σ + t L a₀ Lᵀ
     factor = cholesky(add(seen.covariance, time * congruence(seen.operator, a)))
     information = Information.told_by(seen, observed, factor, like)
     if seen.factor is None:
+        # without an error all of the time t is κ
         return Told(information, 1 / time)
+    # an error counts as time behind the tip, of so much covariance at most, to which t is added
     error = Information.told_by(seen, observed, seen.factor, like)
     # κ a for the κ of which this is the rate is no more than the error, for whatever direction
     rate = jnp.trace(error.H) * jnp.sum(diagonal(a, like.shape[0]))
@@ -106,6 +111,7 @@ def told_by(seen: Observation, observed: State, time: Array, a: Structured, like
 
 def earlier(told: Told, time: Array, a: Structured) -> Told:
     """What is told of a node tells of the state a time before."""
+    # an observation Rᵀ y + N(0, I), to which a branch of length t adds t Rᵀ a₀ R
     seen, w, c = told.information.as_observation()
     one = jnp.eye(len(w), dtype=w.dtype)
     factor = cholesky(one + time * promote(congruence(seen.operator, a), 2, len(w)))
@@ -115,6 +121,7 @@ def earlier(told: Told, time: Array, a: Structured) -> Told:
 
 def _after(rate, time):
     """1/(κ + t)."""
+    # from the rate, which is finite where κ is infinite: where nothing is seen
     return rate / (1 + time * rate)
 
 
@@ -132,16 +139,25 @@ class Seen(NamedTuple):
 def as_seen(told: Told, a: Structured, everything: bool) -> Seen:
     """`everything`: whether all of every state is seen."""
     seen, value, _ = told.information.as_observation()
-    operator, R, n, dtype = seen.operator, seen.operator.T, len(value), value.dtype
+    operator = seen.operator
+    R = operator.T
+    n = len(value)
+    dtype = value.dtype
+    # of w = Rᵀ x + N(0, I): the covariance of all its error, and x̂ = R⁻ᵀ w
     whole = jnp.eye(n, dtype=dtype)
     mean = solve_lower(R, value, transposed=True)
     if everything:
+        # the same as x̂ = x + N(0, H⁻¹), H⁻¹ = R⁻ᵀ R⁻¹, whose operator is 1
         inverse = solve_lower(R, whole)
-        operator, value, whole = jnp.ones((), dtype), mean, inverse.T @ inverse
+        operator = jnp.ones((), dtype)
+        value = mean
+        whole = inverse.T @ inverse
+    # the inner `where` keeps a division by 0 out of the derivative
     kappa = jnp.where(told.rate > 0, 1 / jnp.where(told.rate > 0, told.rate, 1.0), 0.0)
     kappa = (1 - _KEPT) * kappa
     error = whole - kappa * promote(congruence(operator, a), 2, n)
-    # and where it does not, nothing follows
+    # where rounding has left no covariance nothing follows, and what is factorised then is
+    # another matrix: the derivative of a factor that is NaN would be NaN too
     found = jnp.all(jnp.isfinite(cholesky(lax.stop_gradient(error))))
     factor = cholesky(jnp.where(found, error, whole))
     return Seen(

@@ -69,6 +69,7 @@ class Tree(eqx.Module):
         names: Sequence[str | None] | None = None,
         observed: Sequence[int] | None = None,
     ):
+        # parents first: all else is checked against the number of nodes
         self.parents = _as_parents(parents)
         self.names = _as_names(names, self.num_nodes)
         self.lengths = as_float(lengths, "lengths")
@@ -83,6 +84,7 @@ class Tree(eqx.Module):
             f"i − 1; got shape {self.lengths.shape}.",
         )
         value = concrete(self.lengths)
+        # traced lengths cannot be looked at
         if value is None:
             return
         bad = np.flatnonzero(~(np.isfinite(value) & (value >= 0)))
@@ -117,12 +119,10 @@ class Tree(eqx.Module):
             f"shape {lengths.shape}.",
         )
         own = _as_names(names, len(order))
-        seen = (
-            None
-            if observed is None
-            else [place[node] for node in _as_observed(observed, len(order))]
-        )
-        place[-1] = -1
+        seen = None
+        if observed is not None:
+            seen = [place[node] for node in _as_observed(observed, len(order))]
+        place[-1] = -1  # the parent of the root
         above = [place[int(parents[node])] for node in order]
         return cls(above, lengths[np.array(order[1:], int)], [own[node] for node in order], seen)
 
@@ -158,9 +158,11 @@ class Tree(eqx.Module):
         )
         if lengths[0]:  # the process starts before the first split
             parents = [-1, *(parent + 1 for parent in parents)]
-            lengths, names = [0.0, *lengths], [None, *names]
+            lengths = [0.0, *lengths]
+            names = [None, *names]
         if unit_lengths:
             lengths = [1.0] * len(parents)
+        # a tree of the topology alone, for its words: messages call a node by what is below it
         tree = cls(parents, np.ones(len(parents) - 1), names)
         missing = [node for node, length in enumerate(lengths) if length is None and node > 0]
         require(
@@ -173,9 +175,7 @@ class Tree(eqx.Module):
 
     @classmethod
     def chain(cls, times: ArrayLike, names: Sequence[str | None] | None = None) -> "Tree":
-        """A time series: nodes one after the other, at `times` `(m,)` since the root, all of them
-        seen.
-        """
+        """A time series: nodes in a row, at `times` `(m,)` since the root, all of them seen."""
         times = _as_vector(times, "times")
         value = concrete(times)
         require(
@@ -207,9 +207,7 @@ class Tree(eqx.Module):
 
     @property
     def active(self) -> tuple[int, ...]:
-        """Numbers of the nodes but the root that lead to something seen: those whose branches have
-        noise.
-        """
+        """Nodes but the root that lead to something seen: those whose branches have noise."""
         return schedule(self.parents, self.observed).active
 
     @property
@@ -220,9 +218,10 @@ class Tree(eqx.Module):
     @property
     def depths(self) -> Float[Array, " nodes"]:
         """For each node the time since the root."""
+        # A cumulative sum from the root would be a loop over nodes. Pointer jumping takes log₂ as
+        # many steps: each time twice as many branches are summed.
         depths = jnp.concatenate([jnp.zeros((1,), self.lengths.dtype), self.lengths])
         jump = np.maximum(self.parents, 0)
-        # each time twice as many branches are summed
         for _ in range(int(np.ceil(np.log2(self.num_nodes)))):
             depths = depths + jnp.where(jump > 0, depths[jump], 0.0)
             jump = jump[jump]
@@ -294,18 +293,17 @@ class Tree(eqx.Module):
             len(numbers) > 0,
             "`names` must hold at least one name, of a node in the clade; got none.",
         )
-        ancestor = max(set.intersection(*(set(self._lineage(node)) for node in numbers)))
+        # in preorder the last common ancestor has the largest number, and a subtree is one block
+        lineages = [set(self._lineage(node)) for node in numbers]
+        ancestor = max(set.intersection(*lineages))
         first = ancestor if flag(stem, "stem") else ancestor + 1
         nodes = np.arange(1, self.num_nodes)
         return (nodes >= first) & (nodes < self._end(ancestor))
 
     def _number(self, name: str) -> int:
         if not isinstance(name, str) or name not in self.names:
-            near = (
-                difflib.get_close_matches(name, self._known_names, n=3)
-                if isinstance(name, str)
-                else []
-            )
+            text = name if isinstance(name, str) else ""
+            near = difflib.get_close_matches(text, self._known_names, n=3)
             hint = f" Near it: {', '.join(map(repr, near))}." if near else ""
             raise ValueError(
                 f"`names` must be names of nodes of the tree; it has no {words(name)}.{hint}"
@@ -323,13 +321,13 @@ class Tree(eqx.Module):
         name that is given several times is a node of which there are as many rows of data, such as
         specimens of a species.
         """
-        return Tree(
-            self.parents, self.lengths, self.names, [self._number(name) for name in _several(names)]
-        )
+        observed = [self._number(name) for name in _several(names)]
+        return Tree(self.parents, self.lengths, self.names, observed)
 
     def pruned(self, names: Iterable[str]) -> "Tree":
-        """The tree of these tips alone: branches that meet without a split become one, of the sum
-        of their lengths.
+        """The tree of these tips alone: branches that meet without a split become one.
+
+        Its length is the sum of theirs.
         """
         wanted = {self._number(name) for name in _several(names)}
         inner = wanted - set(self.tips)
@@ -340,12 +338,17 @@ class Tree(eqx.Module):
         )
         needed = sorted(set().union(*(self._lineage(node) for node in wanted)))
         children = Counter(self.parents[node] for node in needed[1:])
+        # the root stays, even with one child: the process starts there
         kept = [node for node in needed if node == 0 or node in wanted or children[node] > 1]
         place = {node: i for i, node in enumerate(kept)}
-        parents, branches, owners = [-1], [], []
+        parents = [-1]
+        branches = []
+        owners = []
         for node in kept[1:]:
-            owner, above = place[node], node
-            # the branches down from the kept node before it
+            owner = place[node]
+            above = node
+            # all branches on the way up to the next kept node are one: a sum of lengths, which
+            # may be traced, so that only numbers of branches are collected here
             while above == node or above not in place:
                 branches.append(above - 1)
                 owners.append(owner - 1)
@@ -381,6 +384,7 @@ class Tree(eqx.Module):
         The nodes between are not seen and have no names. Node i becomes node `sum(pieces[:i])`.
         """
         counts = np.array(positive_integers(pieces, "pieces", self.num_nodes - 1, "branches"))
+        # where nodes are now: the pieces of a branch come before its node, so preorder stays
         place = np.concatenate([[0], np.cumsum(counts)])
         parents = np.arange(-1, place[-1])  # a piece begins where the one before it ends
         # or, the first, where the branch does
@@ -408,14 +412,15 @@ class Tree(eqx.Module):
         near spellings, and for other numbers of rows than `observed` has, and shapes that differ.
         """
         unnamed = [node for node in self.observed if self.names[node] is None]
+        first = self._in_words(unnamed[0]) if unnamed else ""
         require(
             not unnamed,
-            "the seen nodes must have names to find their data by; "
-            f"{self._in_words(unnamed[0]) if unnamed else ''} has none. Give the tree `names`, or "
-            "arrange the rows by `tree.observed` yourself.",
+            f"the seen nodes must have names to find their data by; {first} has none. Give the "
+            "tree `names`, or arrange the rows by `tree.observed` yourself.",
         )
         seen = Counter(name for name in self.observed_names if name is not None)
         rows = _by_name(data, names, seen)
+        # by name, never by position: a file in another order would be a wrong likelihood
         require(set(rows) == set(seen), _difference(list(seen), list(rows)))
         for name, count in seen.items():
             require(
@@ -424,6 +429,7 @@ class Tree(eqx.Module):
                 "times. `tree.observing(names)`, with a name for each row, makes several rows of "
                 "a node; or average them.",
             )
+        # in the order of `observed`, of which the counter has kept that of the names
         named = [(name, known_float(row, f"data['{name}']")) for name in seen for row in rows[name]]
         values = [value for _, value in named]
         odd = [(name, value.shape) for name, value in named if value.shape != values[0].shape]
@@ -447,6 +453,7 @@ def _as_vector(values: ArrayLike, name: str) -> Array:
 
 def _as_parents(parents: Sequence[int]) -> tuple[int, ...]:
     """Numbers in preorder: each parent comes before its children, and a subtree is one block."""
+    # the preorder of a tree in preorder is that which it has
     numbers = _preorder(parents)
     require(
         numbers == list(range(len(numbers))),
@@ -457,9 +464,7 @@ def _as_parents(parents: Sequence[int]) -> tuple[int, ...]:
 
 
 def _preorder(parents: Sequence[int]) -> list[int]:
-    """Numbers of the nodes, the root first and children in their order; `ValueError` for what is no
-    tree.
-    """
+    """Numbers of the nodes in preorder, children as they come; `ValueError` for what is no tree."""
     array = known_float(parents, "parents")
     count = array.size
     require(
@@ -480,11 +485,14 @@ def _preorder(parents: Sequence[int]) -> list[int]:
     for node, parent in enumerate(numbers):
         if parent >= 0:
             children[parent].append(node)
-    order, waiting = [], [int(roots[0])]
+    # a stack, since a recursion has no room for a chain of a thousand nodes
+    order = []
+    waiting = [int(roots[0])]
     while waiting:
         node = waiting.pop()
         order.append(node)
         waiting.extend(reversed(children[node]))
+    # each node has one parent: what the root does not lead to is a circle
     lost = sorted(set(range(count)) - set(order))
     require(
         not lost, f"`parents` must lead to the root; those of the nodes {lost[:5]} run in a circle."
@@ -496,7 +504,7 @@ def _as_names(names: Sequence[str | None] | None, count: int) -> tuple[str | Non
     if names is None:
         return (None,) * count
     several = isinstance(names, Iterable) and not isinstance(names, (str, bytes))
-    own = tuple(names) if several else ()
+    own = tuple(names) if several else ()  # a text is iterable, and no list of names
     require(
         len(own) == count,
         f"`names` must be one for each of {count} nodes, None where there is none; got "
@@ -546,11 +554,10 @@ def _by_name(data, names, seen: Counter[str]) -> dict[str, list]:
             "`data` must be arrays by name, `Specimen`s, or an array with `names=`; got "
             f"{words(data)}.",
         )
-        names, data = (
-            [specimen.id for specimen in specimens],
-            [specimen.landmarks for specimen in specimens],
-        )
+        names = [specimen.id for specimen in specimens]
+        data = [specimen.landmarks for specimen in specimens]
     names = _several(names)
+    # a list of specimens' landmarks stays one: `rows` says which of them has another shape
     data = data if isinstance(data, list) else known_float(data, "data")
     require(
         len(names) == len(data),
@@ -574,7 +581,8 @@ def _rows_of(value, name: str) -> list:
 
 def _difference(seen: list[str], given: list[str]) -> str:
     """What is wrong with the names, both sides, and what may be meant."""
-    without, unknown = sorted(set(seen) - set(given)), sorted(map(str, set(given) - set(seen)))
+    without = sorted(set(seen) - set(given))
+    unknown = sorted(map(str, set(given) - set(seen)))  # as text: specimens may have no name
     lines = ["the names of the data and those of the seen nodes must be the same."]
     if without:
         lines.append(f"Without data: {', '.join(without)}.")
