@@ -75,6 +75,7 @@ def test_phylogeny_reads_files(tmp_path):
     out = run(str(ROOT / "examples/phylogeny.py"), *chosen, cwd=tmp_path)
     assert "tips without shapes, left out: d" in out and "5 specimens of 3 species, 10 points" in out
     assert "r_hat" in out and "divergences: 0" in out and "ancestors: 40 coordinates" in out
+    assert out.count("95 % of those predicted in") == 3
     require_written(tmp_path, "phylogeny.nc", "phylogeny_ladder.png", "phylogeny_posterior.png")
 
 
@@ -94,6 +95,26 @@ a, b, c = shapes[2], shapes[[0, 3]].mean(axis=0), shapes[1]
 np.testing.assert_allclose(data.start, (2 * a + 2 * b + 3 * c) / 7, atol=1e-5)
 np.testing.assert_allclose(data.rows, shapes[[2, 0, 3, 1]])
 assert phylogeny.name_of(data.tree, 1) == "a–b"
+
+# A point has variance α² π ℓ² (1 + u) a time, between species and, in proportion, within.
+chosen = phylogeny.settings(phylogeny.options("").parse_args(["--longest", "0.5"]))
+law = phylogeny.law_of(data, chosen, amplitude=0.2, length_scale=0.5, within=0.1, nugget=0.3)
+apart = np.sum((data.start[:, None] - data.start) ** 2, axis=-1)
+expected = np.exp(-apart / (4 * 0.5**2)) + 0.3 * np.eye(3)
+between = 0.2**2 * np.pi * 0.5**2 * expected
+np.testing.assert_allclose(law.parts["sde"].covariance(0.0, data.start), between, rtol=1e-5)
+np.testing.assert_allclose(law.parts["match"].observation(law.parts["sde"], data.start).covariance,
+                           0.1**2 * expected / 1.3, rtol=1e-5)
+
+# Means of a, b, c are 0, (1, 2, 3), 5 in both columns; of b one point was seen once.
+rows = np.zeros((4, 3, 2))
+rows[1], rows[2], rows[3] = [[0], [1], [np.nan]], [[2], [3], [3]], 5.0
+of_means = np.array([[0, 0, 0], [1, 2, 3], [5, 5, 5]])
+of_means = of_means - of_means.mean(axis=0)
+found = phylogeny.spread(data._replace(rows=rows), np.nan_to_num(rows))
+expected = [np.sqrt(np.mean(of_means**2)), np.sqrt(np.mean(np.diff(of_means) ** 2)), np.sqrt(4 / 11 * 4)]
+np.testing.assert_allclose(list(found.values()), expected)
+
 np.savetxt("shapes.csv", np.c_[shapes.reshape(4, 6)], delimiter=",", header="x1,y1,x2,y2,x3,y3", comments="")
 open("named.csv", "w").write("id,x1,y1,x2,y2,x3,y3\\nAlpha,0,0,1,0,0,1\\nbeta,0,0,1,0,0,2\\n")
 open("tree.nwk", "w").write("(alpha:1,beta:1);")
