@@ -7,8 +7,9 @@ that take all nodes of one height at once. `flow`: Kunita flows of 16 landmarks,
 30 species of butterflies at 20 points, 6 steps a branch, then steps no longer than the longest of those, then half as
 long, with the spread of the log weight; they are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or
 `../shared/data`. `rate`: how well the rate of Brownian motion is known from trees of 4 to 256 tips of 40 numbers, by
-the tree and by a dense normal law. `paths`, if asked for: how many of 10 000 paths of the default guide fail, on a tree
-of simulated tips, from wing to wing, and on the tree of butterflies, minutes. `large`, if asked for: 425 tips of 118 landmarks, 25 steps a branch, minutes.
+the tree and by a dense normal law. If asked for, minutes each: `paths`, how many of 10 000 paths of the default guide
+fail, on a tree of simulated tips, from wing to wing, and on the tree of butterflies; `large`, 425 tips of 118
+landmarks, 25 steps a branch.
 
 One JSON line each, double precision, run times the minimum of several, memory the peak of the process.
 """
