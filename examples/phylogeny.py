@@ -241,7 +241,8 @@ def report(results, samples, prior):
     print(az.summary(results, var_names=names).to_string())
     for name in names:
         before, after = np.std(prior[name]), np.std(samples[name])
-        print(f"{name}: prior SD {before:.4f}, posterior SD {after:.4f}, ratio {after / before:.2f}")
+        print(f"{name}: {np.mean(samples[name]):.4g}, prior SD {before:.2g}, posterior SD {after:.2g}, ", end="")
+        print(f"ratio {after / before:.2g}")
     table = az.summary(results, var_names=["ancestor"])
     worst, least = table["r_hat"].astype(float).max(), table["ess_bulk"].astype(float).min()
     print(f"ancestors: {len(table)} coordinates, r_hat at most {worst:.3f}, bulk ESS at least {least:.0f}")
@@ -250,18 +251,20 @@ def report(results, samples, prior):
 # %% [markdown]
 # ## Does the model fit?
 # Specimens are simulated at posterior draws. Their spread, between and within species, should be that of the data; and
-# so should that of differences of neighbouring points, which tells whether shapes are as smooth as the flow believes.
+# so should that of differences from the nearest point, which tells whether shapes are as smooth as the flow believes.
 
 
 # %%
 def spread(data, rows):
-    """SD of a coordinate of species, of the difference of neighbouring points, and of specimens of a species."""
+    """SD of a coordinate of species, of its difference from the nearest point, and of specimens of a species."""
+    apart = np.linalg.norm(data.start[:, None] - data.start, axis=-1)
+    nearest = np.argmin(apart + np.diag(np.full(len(apart), np.inf)), axis=1)
     rows = np.where(np.isnan(data.rows), np.nan, rows)
     species = np.array(data.tree.observed_names)
     means = {name: np.nanmean(rows[species == name], axis=0) for name in data.means}
     between = np.stack(list(means.values()))
     between -= np.nanmean(between, axis=0)
-    found = {"species": rms(between), "species, neighbours' differences": rms(np.diff(between, axis=1))}
+    found = {"species": rms(between), "species, from the nearest point": rms(between - between[:, nearest])}
     if data.several:
         residuals = rows - np.stack([means[name] for name in species])
         freed = np.sqrt(1 - len(means) / len(rows))  # of the means
@@ -286,7 +289,7 @@ def check(data, arguments, samples, num_draws=200):
     spreads = [spread(data, rows) for rows in np.asarray(simulated)]
     for name, seen in spread(data, data.rows).items():
         low, high = np.quantile([one[name] for one in spreads], [0.025, 0.975])
-        print(f"SD of {name}: {seen:.4f}, 95 % of those predicted in {low:.4f} to {high:.4f}")
+        print(f"SD of {name}: {seen:.3g}, 95 % of those predicted in {low:.3g} to {high:.3g}")
 
 
 # %% [markdown]

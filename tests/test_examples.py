@@ -111,8 +111,10 @@ rows = np.zeros((4, 3, 2))
 rows[1], rows[2], rows[3] = [[0], [1], [np.nan]], [[2], [3], [3]], 5.0
 of_means = np.array([[0, 0, 0], [1, 2, 3], [5, 5, 5]])
 of_means = of_means - of_means.mean(axis=0)
-found = phylogeny.spread(data._replace(rows=rows), np.nan_to_num(rows))
-expected = [np.sqrt(np.mean(of_means**2)), np.sqrt(np.mean(np.diff(of_means) ** 2)), np.sqrt(4 / 11 * 4)]
+start = np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]])  # the second is nearest to both others
+found = phylogeny.spread(data._replace(rows=rows, start=start), np.nan_to_num(rows))
+differences = of_means - of_means[:, [1, 0, 1]]
+expected = [np.sqrt(np.mean(of_means**2)), np.sqrt(np.mean(differences**2)), np.sqrt(4 / 11 * 4)]
 np.testing.assert_allclose(list(found.values()), expected)
 
 np.savetxt("shapes.csv", np.c_[shapes.reshape(4, 6)], delimiter=",", header="x1,y1,x2,y2,x3,y3", comments="")
