@@ -119,10 +119,12 @@ np.testing.assert_allclose(list(found.values()), expected)
 
 np.savetxt("shapes.csv", np.c_[shapes.reshape(4, 6)], delimiter=",", header="x1,y1,x2,y2,x3,y3", comments="")
 open("named.csv", "w").write("id,x1,y1,x2,y2,x3,y3\\nAlpha,0,0,1,0,0,1\\nbeta,0,0,1,0,0,2\\n")
+open("gap.csv", "w").write("id,x1,y1,x2,y2,x3,y3\\nalpha,0,0,1,0,0,1\\nbeta,0,0,1,0,,\\n")
 open("tree.nwk", "w").write("(alpha:1,beta:1);")
-for names in ("shapes.csv tree.nwk", "named.csv tree.nwk", "no.csv tree.nwk", "named.csv no.nwk"):
-    shapes, tree = names.split()
-    sys.argv[1:] = ["--shapes", shapes, "--tree", tree]
+wrong = "shapes.csv tree.nwk", "named.csv tree.nwk", "no.csv tree.nwk", "named.csv no.nwk", "gap.csv tree.nwk --nugget"
+for names in wrong:
+    shapes, tree, *more = names.split()
+    sys.argv[1:] = ["--shapes", shapes, "--tree", tree, *more]
     try:
         phylogeny.main()
     except SystemExit as end:
@@ -136,10 +138,10 @@ def test_phylogeny_prepares_data_and_says_what_is_wrong(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     said = [line for line in done.stderr.splitlines() if "error:" in line]
-    assert len(said) == 4 and done.stderr.split().count("2") == 4
+    assert len(said) == 5 and done.stderr.split().count("2") == 5
     assert "--names must be a column that every specimen has filled, one of []; got 'id'" in said[0]
     assert "'Alpha'" in said[1] and "alpha" in said[1]
-    assert "no.csv" in said[2] and "no.nwk" in said[3]
+    assert "no.csv" in said[2] and "no.nwk" in said[3] and "--nugget needs shapes without missing points" in said[4]
 
 
 @pytest.mark.slow
