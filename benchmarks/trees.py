@@ -1,13 +1,16 @@
 """What does the likelihood of a tree cost?
 
-    python benchmarks/trees.py [--quick] [--parts linear flow species large]
+    python benchmarks/trees.py [--quick] [--parts linear flow species rate paths large]
 
 `linear`: processes of two traits on random binary trees, value, gradient and compile time, beside
 prunings in NumPy that take all nodes of one height at once. `flow`: Kunita flows of 16 landmarks,
 20 steps a branch. `species`: wings of 30 species of butterflies at 20 points, 6 steps a branch,
 then steps no longer than the longest of those, then half as long, with the spread of the log
 weight; they are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or `../shared/data`.
-`large`, if asked for: 425 tips of 118 landmarks, 25 steps a branch, minutes.
+`rate`: how well the rate of Brownian motion is known from trees of 4 to 256 tips of 40 numbers, by
+the tree and by a dense normal law. If asked for, minutes each: `paths`, how many of 10 000 paths of
+the default guide fail, on a tree of simulated tips, from wing to wing, and on the tree of
+butterflies; `large`, 425 tips of 118 landmarks, 25 steps a branch.
 
 One JSON line each, double precision, run times the minimum of several, memory the peak of the
 process.
@@ -161,19 +164,34 @@ def flow(num_tips: int, repeats: int):
     show(line | {"value_ms": 1e3 * seconds(lambda: value(kernel, noise), repeats)})
 
 
-def species(repeats: int, num_draws: int):
+def butterflies():
+    """Means of species and their tree, or `None` where they are not."""
     file = FOLDER / "morpho" / "forewing_means_20.csv"
     if not file.is_file():
         show({"process": "species", "skipped": f"no {file}: set NUMPYRO_BRIDGES_DATA"})
-        return
+        return None
     sys.path.append(str(Path(__file__).parents[1] / "examples"))
     from phylogeny import prepare
 
     specimens = nb.io.read_csv(file)
     shapes = np.stack([specimen.landmarks for specimen in specimens])
     names = [specimen.id for specimen in specimens]
-    data = prepare(shapes, names, nb.Tree.from_newick(file.parent / "tree.nwk"))
-    space, tree, amplitude = nb.Landmarks(20, 2), data.tree, np.array(0.0982)
+    return prepare(shapes, names, nb.Tree.from_newick(file.parent / "tree.nwk"))
+
+
+def law_of_butterflies(data, amplitude, num_steps):
+    """At the posterior mean of the length scale."""
+    space = nb.Landmarks(20, 2)
+    flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, 0.1836))
+    match = nb.InexactMatch.from_point_sd(0.005, space)
+    return nb.DiffusionTree(flow, data.start, match, tree=data.tree, num_steps=num_steps)
+
+
+def species(repeats: int, num_draws: int):
+    data = butterflies()
+    if data is None:
+        return
+    tree, amplitude = data.tree, np.array(0.0982)
     longest = float(max(tree.lengths)) / 6
     for steps, num_steps in (
         ("6 a branch", 6),
@@ -181,15 +199,11 @@ def species(repeats: int, num_draws: int):
         (f"at most {longest / 2:.3f}", tree.num_steps(longest / 2)),
     ):
 
-        def law(amplitude, num_steps=num_steps):
-            flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, 0.1836))
-            match = nb.InexactMatch.from_point_sd(0.005, space)
-            return nb.DiffusionTree(flow, data.start, match, tree=tree, num_steps=num_steps)
+        def log_weight(amplitude, noise, num_steps=num_steps):
+            return law_of_butterflies(data, amplitude, num_steps).given(noise).log_prob(data.rows)
 
-        def log_weight(amplitude, noise, law=law):
-            return law(amplitude).given(noise).log_prob(data.rows)
-
-        noise = jr.normal(jr.key(0), (num_draws, *law(amplitude).noise_prior().shape()))
+        shape = law_of_butterflies(data, amplitude, num_steps).noise_prior().shape()
+        noise = jr.normal(jr.key(0), (num_draws, *shape))
         value, compile_s = compiled(log_weight, amplitude, noise[0])
         gradient, gradient_compile_s = compiled(
             jax.value_and_grad(log_weight, (0, 1)), amplitude, noise[0]
@@ -210,6 +224,84 @@ def species(repeats: int, num_draws: int):
                 * seconds(lambda run=gradient, z=noise[0]: run(amplitude, z), repeats)
             }
         )
+
+
+def rate(num_tips: int):
+    """Posterior SD of the log of a variance per time, a flat prior: by the tree, and by a dense
+    normal law.
+    """
+    tree, variance = random_tree(num_tips), 1e-3
+    tree = tree.scaled(1 / tree.height)
+    start = np.zeros((20, 2))
+    data = nb.DiffusionTree(
+        nb.BrownianMotion(1.0), start, nb.InexactMatch(variance), tree=tree
+    ).sample(jr.key(0))
+
+    def log_likelihood(log_rate):
+        law = nb.DiffusionTree(
+            nb.BrownianMotion(jnp.exp(log_rate)), start, nb.InexactMatch(variance), tree=tree
+        )
+        return law.given(jnp.zeros(law.noise_prior().shape())).log_prob(data)
+
+    log_rates = np.linspace(-0.8, 0.8, 401)
+    above = np.eye(tree.num_nodes, dtype=bool)
+    for node, parent in enumerate(tree.parents[1:], 1):
+        above[node] |= above[parent]
+    rows = np.array(tree.observed)
+    shared = above[rows][:, 1:] * np.array(tree.lengths) @ above[rows][:, 1:].T
+    times, vectors = np.linalg.eigh(shared)
+    squares = np.sum((vectors.T @ np.asarray(data).reshape(num_tips, -1)) ** 2, axis=1)
+    variances = np.exp(log_rates)[:, None] * times + variance
+    dense = -0.5 * np.sum(40 * np.log(2 * np.pi * variances) + squares / variances, axis=1)
+    own = np.array(jax.jit(lambda x: jax.lax.map(log_likelihood, x))(log_rates))
+
+    def sd(values):
+        weights = np.exp(values - values.max())
+        mean = np.average(log_rates, weights=weights)
+        return np.sqrt(np.average((log_rates - mean) ** 2, weights=weights))
+
+    line = {"process": "Brownian, 40 numbers a tip", "tips": num_tips, "sd_of_log_rate": sd(own)}
+    line |= {"dense": sd(dense), "root_2_over_numbers": np.sqrt(2 / (40 * num_tips))}
+    show(line | {"difference": np.ptp(own - dense)})
+
+
+def paths(num_paths: int):
+    """Log weights of the default guide that are not finite."""
+    from tree_evidence import simulated
+
+    cases = {}
+    kunita = simulated(20)
+    if kunita is not None:
+        law, tips = kunita
+        cases["9 simulated tips, 20 steps a branch"] = law, tips
+    wings = nb.datasets.mosquito_wings(32, "CX").points
+    space = nb.Landmarks(32, 2)
+    match = nb.InexactMatch.from_point_sd(0.005, space)
+    flow = nb.KunitaFlow(space, nb.GaussianKernel(0.1, 0.4))
+    cases["from wing to wing"] = (
+        nb.DiffusionEndpoint(flow, wings[0], match, t1=1.0, num_steps=50),
+        wings[1],
+    )
+    data = butterflies()
+    if data is not None:
+        cases["30 species"] = law_of_butterflies(data, 0.0982, 6), data.rows
+    for name, (law, seen) in cases.items():
+
+        def log_weight(key, law=law, seen=seen):
+            noise = jr.normal(key, law.noise_prior().shape())
+            return law.given(noise).log_prob(seen)
+
+        start = time.perf_counter()
+        run = jax.jit(lambda keys, f=log_weight: jax.lax.map(f, keys, batch_size=20))
+        found = np.array(run(jr.split(jr.key(0), num_paths)))
+        finite = np.isfinite(found)
+        line = {"paths": name, "number": num_paths, "not_finite": int(np.sum(~finite))}
+        line |= {
+            "mean": found[finite].mean(),
+            "sd": found[finite].std(),
+            "least": found[finite].min(),
+        }
+        show(line | {"seconds": time.perf_counter() - start})
 
 
 def large(quick: bool):
@@ -251,8 +343,8 @@ def main():
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small trees only")
-    parts = ("linear", "flow", "species", "large")
-    parser.add_argument("--parts", nargs="+", choices=parts, default=parts[:3])
+    parts = ("linear", "flow", "species", "rate", "paths", "large")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=parts[:4])
     arguments = parser.parse_args()
     quick = arguments.quick
     if "linear" in arguments.parts:
@@ -263,6 +355,11 @@ def main():
             flow(num_tips, 3)
     if "species" in arguments.parts:
         species(5 if quick else 20, 5 if quick else 200)
+    if "rate" in arguments.parts:
+        for num_tips in (4, 16, 64, 256):
+            rate(num_tips)
+    if "paths" in arguments.parts:
+        paths(100 if quick else 10_000)
     if "large" in arguments.parts:
         large(quick)
 

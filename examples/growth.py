@@ -155,8 +155,11 @@ def given(law, key=None):
 
 # %%
 kernel = NUTS(model)
-num_chains = 2 if arguments.quick else 4
-run = {"num_warmup": arguments.warmup, "num_samples": arguments.samples, "num_chains": num_chains}
+run = {
+    "num_warmup": arguments.warmup,
+    "num_samples": arguments.samples,
+    "num_chains": arguments.chains,
+}
 mcmc = MCMC(kernel, chain_method="vectorized", **run)
 began, key, fields = time.perf_counter(), jr.key(arguments.seed), ("diverging",)
 if arguments.run is None:
@@ -164,7 +167,7 @@ if arguments.run is None:
 else:
     nb.infer.run_checkpointed(mcmc, arguments.run, key, later, extra_fields=fields)
 posterior = jax.block_until_ready(mcmc.get_samples())
-print(f"{time.perf_counter() - began:.0f} s for {num_chains} chains; ", end="")
+print(f"{time.perf_counter() - began:.0f} s for {arguments.chains} chains; ", end="")
 print(f"divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
 
 prior = Predictive(parameters, num_samples=2000)(jr.key(1))

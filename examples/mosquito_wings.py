@@ -97,8 +97,7 @@ space = nb.Landmarks(num_points=num_points, dim=2)
 seen = nb.InexactMatch.from_point_sd(0.005, space)
 spread = float(np.std(points - mean))
 print(
-    f"{len(points)} shapes of {label}, {num_points} points: spread of a coordinate "
-    f"{spread:.4f},",
+    f"{len(points)} shapes of {label}, {num_points} points: spread of a coordinate {spread:.4f},",
     end=" ",
 )
 print(f"observation SD 0.005, ratio {0.005 / spread:.2f}")

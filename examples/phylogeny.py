@@ -11,6 +11,7 @@
 #     python examples/phylogeny.py --shapes wings.csv --names species --tree tree.nex
 #     python examples/phylogeny.py --shapes wings.tps --table specimens.csv --by specimen \
 #         --names tip --tree tree.nwk
+#     JAX_ENABLE_X64=1 python examples/phylogeny.py ... --nugget   # hundreds of specimens
 #     python examples/phylogeny.py ... --quick       # under a minute, to see that all runs
 #     python examples/phylogeny.py ... --run saved   # saved as it goes; after a kill the same line
 #                                                    # goes on from there
@@ -61,11 +62,23 @@ def options(description, **defaults):
     )
     parser.add_argument("--warmup", type=int, default=200)
     parser.add_argument("--samples", type=int, default=400)
+    parser.add_argument("--chains", type=int, default=4)
     parser.add_argument(
         "--fixed-root", action="store_true", help="the root is the mean, for certain"
     )
     parser.add_argument(
+        "--nugget",
+        action="store_true",
+        help="points move on their own too, and specimens vary alike",
+    )
+    parser.add_argument(
         "--run", type=Path, help="a directory to save the run in as it goes, and to go on from"
+    )
+    parser.add_argument(
+        "--sd",
+        type=float,
+        default=0.005,
+        help="of a coordinate, where no species has two specimens",
     )
     parser.add_argument(
         "--magnify", type=float, default=1.0, help="deviations from the start in the drawing"
@@ -93,7 +106,7 @@ def settings(arguments):
     """Those of `--quick` where it was asked for."""
     if arguments.quick:
         arguments.points, arguments.steps, arguments.longest = min(arguments.points, 16), 3, None
-        arguments.warmup, arguments.samples = 30, 50
+        arguments.warmup, arguments.samples, arguments.chains = 30, 50, 2
     return arguments
 
 
@@ -175,21 +188,38 @@ def mean_at_root(tree, rows):
 # The root is as far from that mean as the flow would come in the time of another tree, a priori;
 # with `--fixed-root` it is there. Where no species has two specimens nothing is known of the
 # variation within, and its SD is given by `--sd`.
+#
+# Many specimens of a species tell its mean so well that a smooth flow cannot reach the means of
+# all: without a remedy the length scale falls below the distance of neighbours. With `--nugget` a
+# part of a point's variance is its own, and specimens differ from their species as species differ,
+# by covariances that are in proportion.
 
 
 # %%
-def parameters(several, sd):
-    amplitude = numpyro.sample("amplitude", dist.LogNormal(-2.0, 1.0))
-    length_scale = numpyro.sample("length_scale", dist.LogNormal(-1.0, 0.5))
-    within = numpyro.sample("within", dist.LogNormal(-4.0, 1.0)) if several else sd
-    return amplitude, length_scale, within
+def parameters(several, nugget):
+    drawn = {
+        "amplitude": numpyro.sample("amplitude", dist.LogNormal(-2.0, 1.0)),
+        "length_scale": numpyro.sample("length_scale", dist.LogNormal(-1.0, 0.5)),
+    }
+    if several:
+        drawn["within"] = numpyro.sample("within", dist.LogNormal(-4.0, 1.0))
+    if nugget:
+        drawn["nugget"] = numpyro.sample("nugget", dist.LogNormal(-2.0, 1.0))
+    return drawn
 
 
-def law_of(data, arguments, amplitude, length_scale, within):
-    space, seen = nb.Landmarks(*data.start.shape), np.isfinite(data.rows).all(axis=-1)
-    flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale))
-    if seen.all():
-        match, own = nb.InexactMatch.from_point_sd(within, space), ()
+def law_of(data, arguments, amplitude, length_scale, within=None, nugget=None):
+    space, seen = nb.Landmarks(*data.start.shape, weights=1.0), np.isfinite(data.rows).all(axis=-1)
+    within = arguments.sd if within is None else within
+    # relative to the variance of the flow
+    noise = None if nugget is None else nb.LandmarkNoise(nugget)
+    flow = nb.KunitaFlow(space, nb.GaussianKernel(amplitude, length_scale), noise=noise)
+    own = ()
+    if nugget is not None and data.several:
+        covariance = flow.covariance(0.0, data.start)
+        match = nb.InexactMatch(within**2 * covariance / covariance[0, 0], space=space)
+    elif seen.all():
+        match = nb.InexactMatch.from_point_sd(within, space)
     else:
         match = jax.vmap(lambda points: nb.InexactMatch.from_point_sd(within, space, mask=points))(
             seen
@@ -202,9 +232,10 @@ def law_of(data, arguments, amplitude, length_scale, within):
     )
 
 
-def model_of(data, arguments, sd):
+def model_of(data, arguments):
     def model(rows=None):
-        nb.sample("specimens", law_of(data, arguments, *parameters(data.several, sd)), obs=rows)
+        law = law_of(data, arguments, **parameters(data.several, arguments.nugget))
+        nb.sample("specimens", law, obs=rows)
 
     return model
 
@@ -214,13 +245,13 @@ def model_of(data, arguments, sd):
 
 
 # %%
-def infer(data, arguments, sd):
+def infer(data, arguments):
     """Posterior draws by chain, and results for ArviZ with the ancestors among the posterior."""
-    kernel = nb.infer.FunctionSpaceHMC(model_of(data, arguments, sd))
+    kernel = nb.infer.FunctionSpaceHMC(model_of(data, arguments))
     run = {
         "num_warmup": arguments.warmup,
         "num_samples": arguments.samples,
-        "num_chains": 2 if arguments.quick else 4,
+        "num_chains": arguments.chains,
     }
     mcmc = MCMC(kernel, chain_method="vectorized", **run)
     start, key = time.perf_counter(), jr.key(arguments.seed)
@@ -239,7 +270,7 @@ def infer(data, arguments, sd):
         f"{arguments.samples} draws; divergences: "
         f"{int(np.sum(mcmc.get_extra_fields()['diverging']))}"
     )
-    prior = Predictive(parameters, num_samples=2000)(jr.key(1), data.several, sd)
+    prior = Predictive(parameters, num_samples=2000)(jr.key(1), data.several, arguments.nugget)
     results = nb.to_arviz(mcmc, prior=prior)
     results["posterior"]["ancestor"] = ancestors(data, arguments, results)
     return {name: samples[name] for name in prior}, prior, results
@@ -277,14 +308,67 @@ def report(results, samples, prior):
     for name in names:
         before, after = np.std(prior[name]), np.std(samples[name])
         print(
-            f"{name}: prior SD {before:.4f}, posterior SD {after:.4f}, ratio {after / before:.2f}"
+            f"{name}: {np.mean(samples[name]):.4g}, prior SD {before:.2g}, posterior SD "
+            f"{after:.2g}, ",
+            end="",
         )
+        print(f"ratio {after / before:.2g}")
     table = az.summary(results, var_names=["ancestor"])
     worst, least = table["r_hat"].astype(float).max(), table["ess_bulk"].astype(float).min()
     print(
         f"ancestors: {len(table)} coordinates, r_hat at most {worst:.3f}, bulk ESS at least "
         f"{least:.0f}"
     )
+
+
+# %% [markdown]
+# ## Does the model fit?
+# Specimens are simulated at posterior draws. Their spread, between and within species, should be
+# that of the data; and so should that of differences from the nearest point, which tells whether
+# shapes are as smooth as the flow believes.
+
+
+# %%
+def spread(data, rows):
+    """SD of a coordinate of species, of its difference from the nearest point, and of specimens of
+    a species.
+    """
+    apart = np.linalg.norm(data.start[:, None] - data.start, axis=-1)
+    nearest = np.argmin(apart + np.diag(np.full(len(apart), np.inf)), axis=1)
+    rows = np.where(np.isnan(data.rows), np.nan, rows)
+    species = np.array(data.tree.observed_names)
+    means = {name: np.nanmean(rows[species == name], axis=0) for name in data.means}
+    between = np.stack(list(means.values()))
+    between -= np.nanmean(between, axis=0)
+    found = {
+        "species": rms(between),
+        "species, from the nearest point": rms(between - between[:, nearest]),
+    }
+    if data.several:
+        residuals = rows - np.stack([means[name] for name in species])
+        freed = np.sqrt(1 - len(means) / len(rows))  # of the means
+        found["specimens of a species"] = rms(residuals) / freed
+    return found
+
+
+def rms(x):
+    return np.sqrt(np.nanmean(x**2))
+
+
+def check(data, arguments, samples, num_draws=200):
+    draws = {name: np.ravel(values) for name, values in samples.items()}
+    chosen = np.linspace(0, len(draws["amplitude"]) - 1, num_draws).astype(int)
+    draws = {name: values[chosen] for name, values in draws.items()}
+
+    def simulate(drawn):
+        draw, key = drawn
+        return law_of(data, arguments, **draw).sample(key)
+
+    simulated = jax.lax.map(simulate, (draws, jr.split(jr.key(2), num_draws)))
+    spreads = [spread(data, rows) for rows in np.asarray(simulated)]
+    for name, seen in spread(data, data.rows).items():
+        low, high = np.quantile([one[name] for one in spreads], [0.025, 0.975])
+        print(f"SD of {name}: {seen:.3g}, 95 % of those predicted in {low:.3g} to {high:.3g}")
 
 
 # %% [markdown]
@@ -325,23 +409,12 @@ def save(data, samples, prior, results, arguments, name):
     print("written: " + ", ".join(str(path) for path in written))
 
 
-def analyse(data, arguments, name, sd=0.005):
+def analyse(data, arguments, name):
     """From data to files."""
-    between = np.nanstd(list(data.means.values()) - data.start)
-    residuals = data.rows - np.stack([data.means[name] for name in data.tree.observed_names])
-    free = np.sum(np.isfinite(data.rows)) * (1 - len(data.means) / len(data.rows))
-    within = np.sqrt(np.nansum(residuals**2) / free) if data.several else sd
-    print(
-        f"{len(data.rows)} specimens of {len(data.means)} species, {len(data.start)} points: SD of "
-        "a ",
-        end="",
-    )
-    print(
-        f"coordinate between species {between:.4f}, within "
-        f"{within:.4f}{'' if data.several else ' (given)'}"
-    )
-    samples, prior, results = infer(data, arguments, sd)
+    print(f"{len(data.rows)} specimens of {len(data.means)} species, {len(data.start)} points")
+    samples, prior, results = infer(data, arguments)
     report(results, samples, prior)
+    check(data, arguments, samples)
     save(data, samples, prior, results, arguments, name)
 
 
@@ -354,6 +427,10 @@ def read(arguments):
     """Shapes `(N, n, dim)` in register, the species of each, and the tree."""
     shapes, rows = read_shapes(arguments)
     species = column_of(rows, arguments.names, "--names")
+    if arguments.nugget and np.isnan(shapes).any():
+        raise ValueError(
+            "--nugget needs shapes without missing points: their errors would not be independent."
+        )
     if not arguments.aligned:
         shapes = nb.shapes.procrustes_align(shapes).shapes
     kept = not arguments.blanks
@@ -406,18 +483,12 @@ def main():
     parser.add_argument(
         "--aligned", action="store_true", help="shapes are in register, and are taken as they are"
     )
-    parser.add_argument(
-        "--sd",
-        type=float,
-        default=0.005,
-        help="of a coordinate, where no species has two specimens",
-    )
     arguments = settings(parser.parse_args())
     try:
         data = prepare(*read(arguments))
     except (OSError, ValueError) as error:
         parser.error(str(error))
-    analyse(data, arguments, "phylogeny", arguments.sd)
+    analyse(data, arguments, "phylogeny")
 
 
 if __name__ == "__main__":

@@ -87,7 +87,9 @@ def test_from_a_file_to_a_posterior(file, shared_data, tmp_path):
     """The page's fifteen lines, on shapes that others digitised."""
     page = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
     (block,) = (
-        found for found in re.findall(r"```python\n(.*?)```", page, re.S) if "print_summary" in found
+        found
+        for found in re.findall(r"```python\n(.*?)```", page, re.S)
+        if "print_summary" in found
     )
     _, block = block.split("ellipse in ellipses.points])\n")
     lines = [line for line in block.splitlines() if line.strip()]
@@ -156,6 +158,7 @@ def test_phylogeny_reads_files(tmp_path):
         "tips without shapes, left out: d" in out and "5 specimens of 3 species, 10 points" in out
     )
     assert "r_hat" in out and "divergences: 0" in out and "ancestors: 40 coordinates" in out
+    assert out.count("95 % of those predicted in") == 3
     require_written(tmp_path, "phylogeny.nc", "phylogeny_ladder.png", "phylogeny_posterior.png")
 
 
@@ -175,12 +178,36 @@ a, b, c = shapes[2], shapes[[0, 3]].mean(axis=0), shapes[1]
 np.testing.assert_allclose(data.start, (2 * a + 2 * b + 3 * c) / 7, atol=1e-5)
 np.testing.assert_allclose(data.rows, shapes[[2, 0, 3, 1]])
 assert phylogeny.name_of(data.tree, 1) == "a–b"
+
+# A point has variance α² π ℓ² (1 + u) a time, between species and, in proportion, within.
+chosen = phylogeny.settings(phylogeny.options("").parse_args(["--longest", "0.5"]))
+law = phylogeny.law_of(data, chosen, amplitude=0.2, length_scale=0.5, within=0.1, nugget=0.3)
+apart = np.sum((data.start[:, None] - data.start) ** 2, axis=-1)
+expected = np.exp(-apart / (4 * 0.5**2)) + 0.3 * np.eye(3)
+between = 0.2**2 * np.pi * 0.5**2 * expected
+np.testing.assert_allclose(law.parts["sde"].covariance(0.0, data.start), between, rtol=1e-5)
+np.testing.assert_allclose(law.parts["match"].observation(law.parts["sde"], data.start).covariance,
+                           0.1**2 * expected / 1.3, rtol=1e-5)
+
+# Means of a, b, c are 0, (1, 2, 3), 5 in both columns; of b one point was seen once.
+rows = np.zeros((4, 3, 2))
+rows[1], rows[2], rows[3] = [[0], [1], [np.nan]], [[2], [3], [3]], 5.0
+of_means = np.array([[0, 0, 0], [1, 2, 3], [5, 5, 5]])
+of_means = of_means - of_means.mean(axis=0)
+start = np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]])  # the second is nearest to both others
+found = phylogeny.spread(data._replace(rows=rows, start=start), np.nan_to_num(rows))
+differences = of_means - of_means[:, [1, 0, 1]]
+expected = [np.sqrt(np.mean(of_means**2)), np.sqrt(np.mean(differences**2)), np.sqrt(4 / 11 * 4)]
+np.testing.assert_allclose(list(found.values()), expected)
+
 np.savetxt("shapes.csv", np.c_[shapes.reshape(4, 6)], delimiter=",", header="x1,y1,x2,y2,x3,y3", comments="")
 open("named.csv", "w").write("id,x1,y1,x2,y2,x3,y3\\nAlpha,0,0,1,0,0,1\\nbeta,0,0,1,0,0,2\\n")
+open("gap.csv", "w").write("id,x1,y1,x2,y2,x3,y3\\nalpha,0,0,1,0,0,1\\nbeta,0,0,1,0,,\\n")
 open("tree.nwk", "w").write("(alpha:1,beta:1);")
-for names in ("shapes.csv tree.nwk", "named.csv tree.nwk", "no.csv tree.nwk", "named.csv no.nwk"):
-    shapes, tree = names.split()
-    sys.argv[1:] = ["--shapes", shapes, "--tree", tree]
+wrong = "shapes.csv tree.nwk", "named.csv tree.nwk", "no.csv tree.nwk", "named.csv no.nwk", "gap.csv tree.nwk --nugget"
+for names in wrong:
+    shapes, tree, *more = names.split()
+    sys.argv[1:] = ["--shapes", shapes, "--tree", tree, *more]
     try:
         phylogeny.main()
     except SystemExit as end:
@@ -196,10 +223,14 @@ def test_phylogeny_prepares_data_and_says_what_is_wrong(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     said = [line for line in done.stderr.splitlines() if "error:" in line]
-    assert len(said) == 4 and done.stderr.split().count("2") == 4
+    assert len(said) == 5 and done.stderr.split().count("2") == 5
     assert "--names must be a column that every specimen has filled, one of []; got 'id'" in said[0]
     assert "'Alpha'" in said[1] and "alpha" in said[1]
-    assert "no.csv" in said[2] and "no.nwk" in said[3]
+    assert (
+        "no.csv" in said[2]
+        and "no.nwk" in said[3]
+        and "--nugget needs shapes without missing points" in said[4]
+    )
 
 
 @pytest.mark.slow
