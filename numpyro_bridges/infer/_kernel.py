@@ -14,7 +14,6 @@ import numpyro
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 from numpyro.distributions import biject_to
-from numpyro.infer import init_to_sample
 from numpyro.infer.gibbs import GIBBS_SITES_KWARG
 from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import constrain_fn
@@ -183,7 +182,8 @@ class AbstractBridgeKernel(MCMCKernel):
         return {k: site for k, site in sites.items() if is_latent(site)}
 
     def _check(self, model_args, model_kwargs):
-        sites = self._latent(0, _any_value, model_args, model_kwargs)
+        # noise at zero need not be drawn, which is to be compiled; a prior draw may be a start that the model refuses
+        sites = self._latent(0, init_to_guided_mean, model_args, model_kwargs)
         name = type(self).__name__
         discrete = [k for k, site in sites.items() if site["fn"].support.is_discrete]
         require(not discrete, f"{name} cannot draw the discrete sites {discrete}: give them a block of `Gibbs`.")
@@ -270,11 +270,6 @@ class AbstractBridgeKernel(MCMCKernel):
         n = jnp.where(self._warming(state), state.i, state.i - self._num_warmup) + 1
         mean = jnp.where(n == 1, 0.0, state.mean_accept_prob)
         return mean + (rate - mean) / n
-
-
-def _any_value(site=None):
-    """For `substitute`: where no value matters, the noise need not be drawn, which is to be compiled."""
-    return jnp.zeros(site["fn"].shape()) if site is not None and is_noise(site) else init_to_sample(site)
 
 
 def _seal_of(model_args, model_kwargs):
