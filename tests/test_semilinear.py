@@ -388,6 +388,7 @@ def test_cubic_fields_have_exact_coefficients(space):
         (lambda: nb.SemilinearSDE(-1.0, lambda x: x, 1.0), "`nonlinearity` must be .* of three arguments"),
         (lambda: nb.SemilinearSDE(-1.0, bend, [np.inf]), "`diffusion` must be finite"),
         (lambda: _bridge(nb.SemilinearSDE([-1.0, -2.0], bend, 1.0)), r"`linear` must be .* diagonal \(3,\).*\(2,\)"),
+        (lambda: _bridge(nb.SemilinearSDE(-np.eye(4), bend, 1.0)), "does not diagonalise, is Φᵀ A Φ / q for coeff"),
         (lambda: _bridge(nb.SemilinearSDE(-1.0, lambda t, x, a: x[:2], 1.0)), r"`nonlinearity` must return .*\(2,\)"),
         (lambda: _bridge(nb.SemilinearSDE(-1.0, bend, [1.0, 2.0])), r"`diffusion` must be .*got \(2,\)"),
         (lambda: nb.FrozenGuide(rounds=-1), "`rounds` must be an integer, at least 0; got -1"),
