@@ -90,7 +90,9 @@ def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
         inverse = choose(good & (count > 0), updated, inverse)
         x, value, slope = choose(good, (x + step, new_value, new_slope), (x, value, slope))
         full = -inverse @ slope
-        length = jnp.where(count == 0, jnp.minimum(1.0, 1 / jnp.linalg.norm(full)), 1.0)
+        # at most twice the step before: along directions that no step has tried the inverse Hessian is a guess
+        most = jnp.where(count == 0, 1.0, 2 * jnp.linalg.norm(step))
+        length = jnp.minimum(1.0, most / jnp.linalg.norm(full))
         step = choose(good, length * full, 0.5 * step)
         return _Search(x, value, slope, inverse, step, count + 1)
 
@@ -101,15 +103,9 @@ def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
 
 
 def _inverse_update(inverse: Array, step: Array, change: Array) -> Array:
-    """The BFGS update of the inverse Hessian; none without positive curvature.
-
-    The first one begins with a multiple of the identity that has the curvature of the step (equation 6.20): with the
-    identity itself the next step would be too long by as much as the potential is curved.
-    """
+    """The BFGS update of the inverse Hessian; none without positive curvature."""
     curvature = step @ change
     curved = curvature > 1e-12 * jnp.linalg.norm(step) * jnp.linalg.norm(change)
-    is_first = jnp.all(inverse == jnp.eye(step.size, dtype=step.dtype))
-    inverse = jnp.where(is_first & curved, curvature / (change @ change), 1.0) * inverse
     rho = 1 / jnp.where(curved, curvature, 1.0)
     left = jnp.eye(step.size, dtype=step.dtype) - rho * jnp.outer(step, change)
     return jnp.where(curved, left @ inverse @ left.T + rho * jnp.outer(step, step), inverse)
