@@ -128,7 +128,8 @@ def parameters():
 
 def run(match, observed):
     def model(observed=None):
-        law = nb.DiffusionEndpoint(flow_of(**parameters()), start, match, t1=1.0, num_steps=arguments.steps)
+        flow = flow_of(**parameters())
+        law = nb.DiffusionEndpoint(flow, start, match, t1=1.0, num_steps=arguments.steps, batched=())
         with numpyro.plate("specimen", arguments.specimens):
             nb.sample("wing", law, obs=observed)
 
