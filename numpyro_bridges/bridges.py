@@ -174,6 +174,7 @@ class GuidedBridge(eqx.Module):
         if condition.exact:
             self._check_exact()
         sde.check_end(lambda: self.end()[1])
+        sde.check_error(lambda: condition.observation(sde, x0).factor, grid.elapsed[-1])
 
     def _check_solver(self):
         name = type(self.solver).__name__

@@ -515,3 +515,46 @@ def test_names_that_only_a_slash_keeps_apart():
     mcmc = made_up_run(NUTS(twins), {name: np.zeros((2, 7)) for name in ("moth/mean", "moth.mean")})
     with pytest.raises(ValueError, match=r"\['moth/mean'\] become names of other sites"):
         nb.to_arviz(mcmc)
+
+
+SHAPE = nb.datasets.ellipses(12).mean
+CONTROLS = np.array([0, 3, 6, 9])
+
+
+def carried(data):
+    """A flow whose controls miss more the shorter the length scale is."""
+    length_scale = numpyro.sample("length_scale", dist.LogNormal(1.5, 0.1))
+    flow = nb.KunitaFlow(
+        nb.Landmarks(12, 2),
+        covariance=nb.GaussianKernel(0.1, length_scale),
+        noise=nb.ControlNoise(points=CONTROLS),
+    )
+    law = nb.DiffusionEndpoint(flow, SHAPE, nb.InexactMatch(0.1), t1=1.0, num_steps=STEPS)
+    nb.sample("wing", law, obs=data)
+
+
+def missing_at(length_scale):
+    """By NumPy: of the worst landmark, 1 − a(x, c) a(c, c)⁻¹ a(c, x) / a(x, x)."""
+    square = np.sum((SHAPE[:, None] - SHAPE[None]) ** 2, axis=-1)
+    a = np.exp(-0.5 * square / length_scale**2) + 1e-10 * np.eye(12)
+    across = a[:, CONTROLS]
+    told = np.sum(across * np.linalg.solve(a[np.ix_(CONTROLS, CONTROLS)], across.T).T, axis=1)
+    return np.max(1 - told)
+
+
+def test_draws_that_need_more_controls():
+    """A warning with their share and with what is missing at the worst of them, and none where all
+    have enough.
+    """
+    scales = np.linspace(1.0, 3.0, 14).reshape(2, 7)
+    missing = np.array([missing_at(scale) for scale in scales.ravel()])
+    share = np.mean(missing > 0.01)
+    assert 0.2 < share < 0.8
+    noise = np.zeros((2, 7, STEPS, 4, 2))
+    run = made_up_run(NUTS(carried), {"length_scale": scales, "wing_noise": noise}, (SHAPE,))
+    said = f"`wing` needs more controls than its 4: at {100 * share:.2g} % .* {100 * missing.max():.2g} % at most"
+    with pytest.warns(UserWarning, match=said):
+        nb.to_arviz(run)
+    enough = made_up_run(NUTS(carried), {"length_scale": 4 + scales, "wing_noise": noise}, (SHAPE,))
+    assert missing_at(5.0) < 0.01
+    nb.to_arviz(enough)  # warnings are errors

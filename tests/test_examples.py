@@ -272,6 +272,40 @@ def test_allen_cahn(tmp_path):
 
 
 @pytest.mark.slow
+def test_outlines(tmp_path):
+    pytest.importorskip("ktch")
+    pytest.importorskip("matplotlib")
+    out = run(str(ROOT / "examples/outlines.py"), "--quick", "--output", "output", cwd=tmp_path)
+    assert (
+        out.count("r_hat") == 3
+        and "varifolds less landmarks" in out
+        and "varifolds less sliding" in out
+    )
+    require_written(tmp_path, "outlines.nc", "outlines.png", "outlines_posterior.png")
+
+
+@pytest.mark.slow
+def test_papilio_full(tmp_path):
+    """Two numbers of landmarks, of which one has fewer controls; and a folder of outlines."""
+    pytest.importorskip("matplotlib")
+    s = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
+    ellipses = np.stack([np.stack([a * np.cos(s), np.sin(s)], axis=1) for a in (1.0, 1.2, 1.3)])
+    (tmp_path / "data").mkdir()
+    names = {"species": np.array(["Papilio_a", "Papilio_b"]), "species_index": np.array([0, 0, 1])}
+    np.savez(tmp_path / "data/papilio.npz", aligned=ellipses, **names)
+    chosen = "--quick --data data --pair a b --points 40 80 --output output".split()
+    out = run(str(ROOT / "examples/papilio_full.py"), *chosen, cwd=tmp_path)
+    assert "40 less 80 landmarks" in out
+    require_written(
+        tmp_path,
+        "papilio.nc",
+        "papilio_bridges.png",
+        "papilio_deformation.png",
+        "papilio_posterior.png",
+    )
+
+
+@pytest.mark.slow
 def test_growth(tmp_path):
     pytest.importorskip("matplotlib")
     out = run(str(ROOT / "examples/growth.py"), "--quick", "--output", "output", cwd=tmp_path)

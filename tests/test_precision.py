@@ -136,6 +136,27 @@ def test_ends_to_the_last_digit(seen):
             )
 
 
+@pytest.mark.parametrize("noise", ["landmark", "control"])
+def test_errors_as_small_as_the_jitter(noise):
+    """SD √(1e-5 a(x, x)) = 0.00056 beside an error of 0.001, in single precision; nothing in
+    double, or beside 0.01.
+    """
+    ellipses = nb.datasets.ellipses(8)
+
+    def bridge(point_sd):
+        flow = nb.KunitaFlow(nb.Landmarks(8, 2), nb.GaussianKernel(0.2, 0.5), noise=noise)
+        seen = nb.InexactMatch.from_point_sd(point_sd, flow.space).at(ellipses.points[1])
+        return nb.GuidedBridge(flow, seen, x0=ellipses.points[0], t1=1.0, num_steps=2)
+
+    bridge(0.001)  # warnings are errors
+    with jax.enable_x64(False):
+        bridge(0.01)
+        with pytest.warns(
+            UserWarning, match="1e-05 of a.x, x., moves .* by 0.00056, .* SD 0.001: it is felt"
+        ):
+            bridge(0.001)
+
+
 # Time origins.
 
 SEASONAL = nb.SDE(lambda t, x, _: jnp.sin(t) * jnp.ones_like(x), lambda t, x, _: 0.5)

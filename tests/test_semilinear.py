@@ -470,6 +470,10 @@ def test_cubic_fields_have_exact_coefficients(space):
             r"`linear` must be .* diagonal \(3,\).*\(2,\)",
         ),
         (
+            lambda: _bridge(nb.SemilinearSDE(-np.eye(4), bend, 1.0)),
+            "does not diagonalise, is Φᵀ A Φ / q for coeff",
+        ),
+        (
             lambda: _bridge(nb.SemilinearSDE(-1.0, lambda t, x, a: x[:2], 1.0)),
             r"`nonlinearity` must return .*\(2,\)",
         ),

@@ -21,6 +21,7 @@ from numpyro.ops.provenance import eval_provenance
 
 from .._checks import flag, positive_integer, require, require_instance, require_mapping
 from ..distributions import AbstractNoiseDriven, DiffusionEndpoint, DiffusionTree
+from ._controls import has_controls, missing_variance, warn_of_missing
 from ._posterior import is_latent, is_noise, sites_of
 from ._statistics import statistics
 
@@ -82,6 +83,9 @@ def to_arviz(
     A `/` in a name, as `handlers.scope` makes them, becomes a `.`: in a `DataTree` and in a NetCDF
     file it would be a group. `dims` and `coords` may be given with either.
 
+    A warning says where draws need more controls than a flow has, `ControlNoise`, by the variance
+    that is missing.
+
     **Errors:** `ValueError` for a kernel without a model, for `paths` without such a site, or
     without its noise, for predictions that are not draws of this run, and for names that differ
     only in `/` and `.`.
@@ -141,6 +145,9 @@ def to_arviz(
             for name, (law, value) in replay(values, names).items()
         }
 
+    def missing(values, names):
+        return {name: missing_variance(law) for name, (law, _) in replay(values, names).items()}
+
     def visible(draws):
         return {name: value for name, value in draws.items() if name not in hidden}
 
@@ -177,6 +184,12 @@ def to_arviz(
         }
         own = {name: _labels(tree, dict.fromkeys(tree.observed)) for name, tree in trees.items()}
         datasets["log_likelihood"] = _seen_only(found, seen, axes, coords, own)
+    controlled = [name for name in observed if has_controls(sites[name]["fn"])]
+    if controlled and not unknown(missing, controlled, samples):
+        for name, found in _mapped(
+            lambda draw: missing(lost(samples) | draw, controlled), samples
+        ).items():
+            warn_of_missing(name, found, sites[name]["fn"])
     if nodes and trees:
         draws, driving = _with_noise(mcmc)
         if not unknown(states, trees, driving):

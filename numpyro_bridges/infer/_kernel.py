@@ -16,7 +16,6 @@ import numpyro
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 from numpyro.distributions import biject_to
-from numpyro.infer import init_to_sample
 from numpyro.infer.gibbs import GIBBS_SITES_KWARG
 from numpyro.infer.mcmc import MCMCKernel
 from numpyro.infer.util import constrain_fn
@@ -111,14 +110,18 @@ class AbstractBridgeKernel(MCMCKernel):
             constrained = GIBBS_SITES_KWARG in model_kwargs
             init_params = _starts(init_params, sites, constrained, num_chains) or None
 
-        def one(key, init_params):
+        def one(key, init_params, reference):
             key, key_start, key_reference = jr.split(key, 3)
             z = self._start(key_start, model_args, model_kwargs) | (init_params or {})
-            z, reference = self._near_the_mode(
-                key_reference, z, init_params is not None, model_args, model_kwargs
-            )
+            if init_params is None:
+                z = self._drawn(key_reference, z, reference)
             state = self._init_one(key, z, reference, model_args, model_kwargs)
             return _sealed(state, _seal_of(model_args, model_kwargs))
+
+        def start(keys, init_params):
+            first = init_params if num_chains is None else jax.tree.map(lambda x: x[0], init_params)
+            reference = self._laplace(first, model_args, model_kwargs)  # one search, for all chains
+            return over_chains(partial(one, reference=reference))(keys, init_params)
 
         if num_chains is not None:
             over_chains = partial(spread, mesh=mesh_for(num_chains, "`num_chains`", self._mesh))
@@ -138,7 +141,7 @@ class AbstractBridgeKernel(MCMCKernel):
             )
 
         self._sample_fn = sample
-        state = jax.jit(over_chains(one))(rng_key, init_params)
+        state = jax.jit(start)(rng_key, init_params)
         self._check_start(state, num_chains, model_args, model_kwargs)
         return state
 
@@ -170,7 +173,8 @@ class AbstractBridgeKernel(MCMCKernel):
 
     def postprocess_fn(self, model_args, model_kwargs):
         """Constrained values, and those of deterministic sites."""
-        return partial(constrained, self._model, model_args, model_kwargs or {})
+        # NumPyro calls it as it is
+        return jax.jit(partial(constrained, self._model, model_args, model_kwargs or {}))
 
     def get_constrain_fn(self, model_args, model_kwargs):
         # For the sites of other blocks of `Gibbs`, on which no support depends, any value will do.
@@ -191,7 +195,9 @@ class AbstractBridgeKernel(MCMCKernel):
         return {k: site for k, site in sites.items() if is_latent(site)}
 
     def _check(self, model_args, model_kwargs):
-        sites = self._latent(0, init_to_sample, model_args, model_kwargs)
+        # noise at zero need not be drawn, which is to be compiled; a prior draw may be a start that
+        # the model refuses
+        sites = self._latent(0, init_to_guided_mean, model_args, model_kwargs)
         name = type(self).__name__
         discrete = [k for k, site in sites.items() if site["fn"].support.is_discrete]
         require(
@@ -257,16 +263,20 @@ class AbstractBridgeKernel(MCMCKernel):
         sites = self._latent(key, self._init_strategy, model_args, model_kwargs)
         return {k: biject_to(site["fn"].support).inv(site["value"]) for k, site in sites.items()}
 
-    def _near_the_mode(self, key, z, stay, model_args, model_kwargs):
-        """A Laplace approximation of the parameters' posterior, and a start drawn from it unless
-        one was given.
+    def _laplace(self, init_params, model_args, model_kwargs) -> Reference:
+        """A Laplace approximation of the parameters' posterior: one search, whatever the keys of
+        the chains.
         """
+        z = self._start(jr.key(0), model_args, model_kwargs) | (init_params or {})
         theta, noise, unravel = self._parts(z)
-        reference = laplace(
+        return laplace(
             lambda theta: self._misfit(unravel(theta) | noise, model_args, model_kwargs), theta
         )
-        start = theta if stay else reference.colour(jr.normal(key, theta.shape, theta.dtype))
-        return unravel(start) | noise, reference
+
+    def _drawn(self, key, z, reference: Reference) -> Sites:
+        """z with parameters from the reference."""
+        theta, noise, unravel = self._parts(z)
+        return unravel(reference.colour(jr.normal(key, theta.shape, theta.dtype))) | noise
 
     def _misfit(self, z, model_args, model_kwargs):
         """Φ(θ, z)."""

@@ -123,10 +123,10 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
 
         @jax.jit
         def log_weights(key):
-            key_start, key_mode, key_noise = jr.split(key, 3)
+            key_start, key_noise = jr.split(key)
             z = self._start(key_start, model_args, model_kwargs)
-            _, reference = self._near_the_mode(key_mode, z, True, model_args, model_kwargs)
             _, noise, unravel = self._parts(z)
+            reference = self._laplace(None, model_args, model_kwargs)
             self._owners = driven_by(self._model, model_args, model_kwargs, z, self._noise)
 
             def one(key):

@@ -96,8 +96,11 @@ def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
         inverse = choose(good & (count > 0), updated, inverse)
         x, value, slope = choose(good, (x + step, new_value, new_slope), (x, value, slope))
         full = -inverse @ slope
-        # the first direction is the gradient, whose length is in no unit of x: at most 1
-        length = jnp.where(count == 0, jnp.minimum(1.0, 1 / jnp.linalg.norm(full)), 1.0)
+        # The first direction is the gradient, whose length is in no unit of x: at most 1. Then at
+        # most twice the step before: along directions that no step has tried the inverse Hessian is
+        # a guess.
+        most = jnp.where(count == 0, 1.0, 2 * jnp.linalg.norm(step))
+        length = jnp.minimum(1.0, most / jnp.linalg.norm(full))
         step = choose(good, length * full, 0.5 * step)
         return _Search(x, value, slope, inverse, step, count + 1)
 

@@ -233,6 +233,12 @@ class AbstractSDE(eqx.Module):
         """Warns where the state `find()`, to which paths are led, is beyond this SDE."""
         return None
 
+    def check_error(self, find: Callable[[], Structured | None], duration: RealScalar) -> None:
+        """Warns where the error of observation that `find()` returns, a factor of its covariance,
+        is as small as what the SDE adds to itself for the sake of its digits, in a time.
+        """
+        return None
+
     def check_state(self, x: State) -> None:
         """`ValueError` where x cannot be a state. The time is traced, none in particular."""
         require_space(self.space, x)

@@ -30,6 +30,9 @@ _COINCIDE = 1e-6
 _NEWTON = 8
 """Steps of Newton's method: the digits are doubled by each."""
 
+_FELT = 0.1
+"""Variance of the jitter, relative to that of an observation, from which on there is a warning."""
+
 _SEEN, _REFUSED = 0.01, 0.1
 """Wrong parts of a(x, x) from which on there is a warning, and an error."""
 
@@ -327,6 +330,27 @@ class KunitaFlow(AbstractSDE):
     def check_end(self, find: Callable[[], State]) -> None:
         if not isinstance(self.noise_field, LandmarkNoise) and _known(self):
             self._check_room("condition", find(), refuse=False)
+
+    def check_error(self, find: Callable[[], Structured | None], duration: RealScalar) -> None:
+        variance = self.covariance_kernel.variance
+        jitter = self.noise_field.own_jitter(variance.dtype)
+        factor = None if jitter is None or not _known((variance, jitter, duration)) else find()
+        if jitter is None or factor is None or concrete(factor) is None:
+            return
+        with jax.ensure_compile_time_eval():  # inside a traced program too
+            own = np.sqrt(float(jitter) * float(variance) * float(duration))
+            error = float(
+                jnp.min(jnp.linalg.norm(factor, axis=1) if factor.ndim == 2 else jnp.abs(factor))
+            )
+        if own**2 > _FELT * error**2:
+            warnings.warn(
+                f"the jitter of the noise, {float(jitter):.0e} of a(x, x), moves a landmark by "
+                f"{own:.2g}, beside an "
+                f"error of observation of SD {error:.2g}: it is felt in the result. Give "
+                "`LandmarkNoise(jitter=...)` a smaller one, use double precision "
+                '(`jax.config.update("jax_enable_x64", True)`), or a larger error.',
+                stacklevel=3,
+            )
 
     def _check_room(self, name: str, x: State, refuse: bool) -> None:
         """Where it can be known, says whether the noise has room for a state."""

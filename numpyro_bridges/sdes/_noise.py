@@ -53,6 +53,10 @@ class AbstractNoise(eqx.Module):
         """For a flow that starts at these points."""
         return self
 
+    def own_jitter(self, dtype) -> Array | None:
+        """What is added to a(x, x), as a part of it; `None` where nothing is."""
+        return None
+
     def factored_at(self, points: Float[Array, "q d"]) -> Array | np.ndarray | None:
         """Which points must be apart, since their covariance is factored; `None` if none."""
         return None
@@ -118,6 +122,11 @@ class LandmarkNoise(AbstractNoise):
                 "1e-6 is large.",
             )
 
+    def own_jitter(self, dtype):
+        if self.jitter is None:
+            return jnp.asarray(1e-5 if dtype == jnp.float32 else 1e-10, dtype)
+        return self.jitter.astype(dtype)
+
     def factored_at(self, points):
         return np.arange(len(points))
 
@@ -136,11 +145,8 @@ class LandmarkNoise(AbstractNoise):
     def factored(self, covariance, points) -> tuple[Array, Array, Array]:
         """A factor that has an inverse, whether there is no noise at all, and the covariance."""
         K = covariance.matrix(points, points)
-        jitter = self.jitter
-        if jitter is None:
-            jitter = jnp.asarray(1e-5 if K.dtype == jnp.float32 else 1e-10, K.dtype)
         variance = covariance.variance.astype(K.dtype)
-        K = add(K, jitter.astype(K.dtype) * variance)
+        K = add(K, self.own_jitter(K.dtype) * variance)
         none = variance == 0  # an amplitude that underflows
         return cholesky(jnp.where(none, jnp.eye(len(K), dtype=K.dtype), K)), none, K
 
@@ -246,6 +252,9 @@ class ControlNoise(AbstractNoise):
         index = self.chosen(points).points
         assert index is not None
         return index
+
+    def own_jitter(self, dtype):
+        return self.controls.own_jitter(dtype)
 
     def _count(self, n: int) -> int:
         m = min(n, MOST_CONTROLS) if self.num_points is None else self.num_points

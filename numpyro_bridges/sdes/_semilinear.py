@@ -146,8 +146,9 @@ class SemilinearSDE(AbstractFunctionSDE):
         require(
             self.linear.ndim == 0 or self.linear.shape[0] == n,
             f"`linear` must be a scalar, a diagonal ({n},) or a matrix ({n}, {n}) for a state "
-            f"{x.shape}; got shape {self.linear.shape}. A parameter with a batch axis does this "
-            "too: vmap over it.",
+            f"{x.shape}; got shape {self.linear.shape}. An operator A on values at q points, such "
+            "as one that the basis does not diagonalise, is Φᵀ A Φ / q for coefficients, Φ = "
+            "`space.basis(space.grid)`. A parameter with a batch axis does this too: vmap over it.",
         )
         pulled = at_any_time(self.pulled, x)
         require(
