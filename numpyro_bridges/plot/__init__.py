@@ -8,4 +8,5 @@ from ._deformation import deformation as deformation
 from ._posterior import posterior as posterior
 from ._scores import score_frames as score_frames
 from ._shapes import bridge_fan as bridge_fan, outlines as outlines, path as path, score_field as score_field
+from ._training import training as training
 from ._tree import tree as tree

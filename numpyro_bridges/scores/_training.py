@@ -113,7 +113,7 @@ class _State(eqx.Module):
     history: dict[str, Array]
 
 
-Loss = Callable[[Any, PRNGKeyArray], tuple[Array, Any]]
+Loss = Callable[..., tuple[Array, Any]]
 Judge = Callable[[Any], tuple[Array, ...]]
 
 
@@ -130,11 +130,12 @@ def train(
     progress: bool = True,
     watch: Callable[[Any, dict[str, Array]], None] | None = None,
     mesh: Mesh | None = None,
+    prepare: Callable[[Any, PRNGKeyArray], Any] | None = None,
 ) -> tuple[Any, dict[str, Array]]:
     """The best network, and the history.
 
-    `loss(network, key)` gives the loss of a batch and the network with its own state renewed; `judge(network)`,
-    compiled, a value to be maximised, the bound and the ESS fraction on held-out paths, and what else it likes. A
+    `loss(network, key)` gives the loss of a batch and the network with its own state renewed; with `prepare` it is
+    `loss(network, key, prepared)`, where `prepare(network, key)` is called after each look; `judge(network)`, compiled, a value to be maximised, the bound and the ESS fraction on held-out paths, and what else it likes. A
     network of a better value is kept unless its ESS is less than half of that of the one kept before: the bound
     E log w is little moved by large weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the
     same key gives the same network, however often training is resumed from `file`, which is refused where it was
@@ -161,12 +162,16 @@ def train(
     @eqx.filter_jit
     def advance(state: _State) -> tuple[_State, Array]:
         first, last = state.update, jnp.minimum(state.update + training.interval, training.num_updates)
+        prepared = ()
+        if prepare is not None:
+            key_prepare = jr.fold_in(key, training.num_updates + first)  # no update has this number
+            prepared = (prepare(eqx.combine(state.average, static), key_prepare),)
 
         def update(i, carry):
             arrays, average, memory, losses = carry
 
             def value(arrays):
-                loss_value, renewed = loss(eqx.combine(arrays, static), jr.fold_in(key, i))
+                loss_value, renewed = loss(eqx.combine(arrays, static), jr.fold_in(key, i), *prepared)
                 return loss_value, eqx.filter(renewed, eqx.is_inexact_array)
 
             (batch_loss, renewed), gradient = jax.value_and_grad(value, has_aux=True)(arrays)
