@@ -31,7 +31,8 @@ class Training(eqx.Module):
     - `num_updates`: at most. `batch_size`: paths, or particles of a cloud, per update.
     - `optimizer`: of optax; by default Adam with a warm-up of 50 updates and a cosine decay from `learning_rate`, the
       gradient's norm clipped to 1.
-    - `average`: decay of the exponential average of the iterates, which is what is judged and returned; 0 is none.
+    - `average`: decay of the exponential average of the iterates, which is what is judged and returned; 0 is none. At
+      update i it is (1 + i)/(10 + i) if that is less, so that the start is soon forgotten.
     - `interval`: updates between looks at the held-out paths. `held_out`: their number.
     - `patience`: looks without a better bound after which training stops; `None` does not stop and keeps the last
       network in place of the best.
@@ -56,7 +57,7 @@ class Training(eqx.Module):
         *,
         learning_rate: float = 2e-3,
         optimizer: optax.GradientTransformation | None = None,
-        average: float = 0.98,
+        average: float = 0.99,
         interval: int = 100,
         held_out: int = 256,
         patience: int | None = 5,
@@ -178,7 +179,8 @@ def train(
             with jax.numpy_dtype_promotion("standard"):  # optax needs it
                 steps, memory = optimizer.update(gradient, memory, renewed)
                 arrays = optax.apply_updates(renewed, steps)
-            average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, average, arrays)
+            kept = jnp.minimum(decay, (1 + i) / (10 + i))
+            average = jax.tree.map(lambda a, b: (kept * a + (1 - kept) * b).astype(a.dtype), average, arrays)
             return arrays, average, memory, losses.at[i - first].set(batch_loss)
 
         start = state.network, state.average, state.optimizer, jnp.zeros(training.interval)
