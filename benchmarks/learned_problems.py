@@ -10,8 +10,8 @@ One JSON line for each problem and method:
   evidence of the same Euler chain by a referee outside the package, where there is one, and `errors_off`, how many
   standard errors lie between them.
 - `kl`, `kl_error`: ½ E Σ |b* − b|²_a⁻¹ dt over the steps but the last and paths of the exact h-transform, where h is
-  known, as in the literature. `kl_of_chains`: E* log w − log p, of the same paths; the steps of a guide are Gaussian and
-  those of the conditioned chain are not, so this does not fall to 0.
+  known, as in the literature. `kl_of_chains`: E* log w − log p, of the same paths; the steps of a guide are Gaussian,
+  those of the conditioned chain are not, and this does not fall to 0.
 - `seconds` of training (updates and clouds, compilation apart), `updates`, `training_wall`, `run_seconds` of the paths,
   `seconds_per_effective` of these, and `paid_after`, the number of effective paths from which training has paid for
   itself against the first row of the problem.

@@ -533,7 +533,6 @@ SCORES = [
 ]
 
 
-
 def traced(f, value=0.5):
     """f in a program, where `value` is traced and constants are known."""
     return jax.eval_shape(f, jnp.asarray(value))

@@ -93,9 +93,9 @@ def guided_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, least: floa
     """h(t, ·) of a bridge, at points of its conditioned paths: the paths of its guide, by their weights.
 
     The weights are w^β, with β ≤ 1 as large as leaves a fraction `least` of the paths effective. At β = 1 the targets
-    are those of the conditioned process, whatever the guide. Below they are those of a process between it and the guide:
-    the guide that learns them is a better one, of a larger β, until nothing is left between. The ρ of each half of the
-    paths is found in the other half, since targets are unbiased for numbers ρ that do not know them.
+    are those of the conditioned process, whatever the guide, and only then is ∇log h what is learned. Below it is
+    something between, which serves to find a guide of a larger β. The ρ of each half of the paths is found in the other
+    half, since targets are unbiased for numbers ρ that do not know them.
     """
     half = -(-size // 2)
     noise = jr.normal(key, (2 * half, *bridge.noise_shape), bridge.x0.dtype)

@@ -1,7 +1,8 @@
 """Training of learned guides: what is the same for every method, and the four methods.
 
 - `residual`: the evidence bound E log w is maximised (Yang, van der Meulen and Sommer 2025).
-- `matching`: score matching on weighted paths of the guide as it learns (Domingo-Enrich, Han, Amos, Bruna and Chen 2024).
+- `matching`: score matching on weighted paths of the guide as it learns (Domingo-Enrich, Han, Amos, Bruna and Chen
+  2024).
 - `adjoint`: score matching on the weighted reversed process from the observation (Baker, Schauer and Sommer 2025).
 - `reversal`: score matching of the unconditioned process gives the time reversal; score matching on its paths gives the
   bridge (Heng, De Bortoli, Doucet and Thornton 2021), twice reversed.
@@ -541,8 +542,8 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> tupl
     lost = int(jnp.sum(~jnp.all(jnp.isfinite(paths), axis=(1, 2, 3))))
     require(
         lost == 0,
-        f"`sde` must have paths that stay finite, and {lost} of {num_paths} led by the guide do not: its drift explodes, "
-        "or a step is too long for it. Increase `num_steps`, or give another `guide`.",
+        f"`sde` must have paths that stay finite, and {lost} of {num_paths} led by the guide do not: its drift "
+        "explodes, or a step is too long for it. Increase `num_steps`, or give another `guide`.",
     )
     duration = bridge.grid.elapsed[-1]
     pooled = isinstance(bridge.sde.space, Landmarks)
@@ -562,9 +563,7 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> tupl
         f"`context` must vary over what is drawn, and its number {still[:1]} is {theta[0, still[:1]]} in all of "
         f"{num_paths} problems: a network cannot learn from it. Leave it out, or let `draw` vary it.",
     )
-    standard = Standard(
-        duration, scale, centre, width, jnp.mean(theta, axis=0), deviation
-    )
+    standard = Standard(duration, scale, centre, width, jnp.mean(theta, axis=0), deviation)
     guide = ScoreGuide(bridge.guide, network, standard, context)
     _check_output(guide, bridge)
     return guide, _STRIDE * jnp.max(jnp.abs(paths - v[:, None]))

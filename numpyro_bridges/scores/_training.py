@@ -136,13 +136,14 @@ def train(
     """The best network, and the history.
 
     `loss(network, key)` gives the loss of a batch and the network with its own state renewed; with `prepare` it is
-    `loss(network, key, prepared)`, where `prepare(network, key)` is called after each look; `judge(network)`, compiled, a value to be maximised, the bound and the ESS fraction on held-out paths, and what else it likes. A
-    network of a better value is kept unless its ESS is less than half of that of the one kept before: the bound
-    E log w is little moved by large weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the
-    same key gives the same network, however often training is resumed from `file`, which is refused where it was
-    written for another `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is
-    called at each look with the network that was looked at. Seconds are of the updates, compilation apart. The file is
-    written by the first process of `mesh`, over which the loss spreads its paths.
+    `loss(network, key, prepared)`, where `prepare(network, key)` is called after each look. `judge(network)`, compiled,
+    gives a value to be maximised, the bound and the ESS fraction on held-out paths, and what else it likes. A network
+    of a better value is kept unless its ESS is less than half of that of the one kept before: the bound E log w is
+    little moved by large weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the same key gives
+    the same network, however often training is resumed from `file`, which is refused where it was written for another
+    `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is called at each look with
+    the network that was looked at. Seconds are of the updates, compilation apart. The file is written by the first
+    process of `mesh`, over which the loss spreads its paths.
     """
     optimizer, decay = training.optimizer, training.average
     looks = -(-training.num_updates // training.interval) + 1
