@@ -429,15 +429,16 @@ def trained(training=None, key=0, loss=quadratic, judge=judged, **kwargs):
     return train(jnp.zeros(2), loss, judge, jr.key(key), training, progress=False, **kwargs)
 
 
-def test_what_is_learned_from_is_prepared_after_each_look():
-    """With the network that was looked at: here each interval adds its two updates of that network's size and 1."""
+def test_what_is_learned_from_is_prepared_anew(monkeypatch):
+    """After two updates, and after a look at three: 0, 2, 5, 17, 35."""
+    monkeypatch.setattr(training_module, "_PREPARED", 2)
 
     def loss(network, key, prepared):
         return -jnp.sum(network * prepared), network
 
-    training = nb.scores.Training(6, optimizer=optax.sgd(1.0), interval=2, average=0.0, patience=None)
+    training = nb.scores.Training(6, optimizer=optax.sgd(1.0), interval=3, average=0.0, patience=None)
     network, _ = trained(training, loss=loss, prepare=lambda network, key: 1 + network)
-    np.testing.assert_allclose(network, [26.0, 26.0])  # 0, 2, 8, 26
+    np.testing.assert_allclose(network, 5 + 2 * 6 + 18)
 
 
 def test_training_goes_on_where_it_was_killed(tmp_path, monkeypatch):

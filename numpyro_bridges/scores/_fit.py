@@ -229,7 +229,7 @@ def residual(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
 
 
 def matching(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
-    """Score matching on weighted paths of the guide as it learns, which are drawn anew after each look."""
+    """Score matching on weighted paths of the guide as it learns, which are drawn anew as it does."""
     bridge = problem.draw(key)
     _need_noise(bridge, "matching")
     _need_value(bridge, "matching")

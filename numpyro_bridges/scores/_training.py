@@ -5,6 +5,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,7 @@ class _State(eqx.Module):
 
 
 Loss = Callable[..., tuple[Array, Any]]
+_PREPARED = 25  # updates, for which what is prepared serves
 Judge = Callable[[Any], tuple[Array, ...]]
 
 
@@ -136,8 +138,9 @@ def train(
     """The best network, and the history.
 
     `loss(network, key)` gives the loss of a batch and the network with its own state renewed; with `prepare` it is
-    `loss(network, key, prepared)`, where `prepare(network, key)` is called after each look. `judge(network)`, compiled,
-    gives a value to be maximised, the bound and the ESS fraction on held-out paths, and what else it likes. A network
+    `loss(network, key, prepared)`, where `prepare(network, key)` is called after each look and 25 updates, with the
+    average. `judge(network)`, compiled, gives a value to be maximised, the bound and the ESS fraction on held-out
+    paths, and what else it likes. A network
     of a better value is kept unless its ESS is less than half of that of the one kept before: the bound E log w is
     little moved by large weights, and may rise where the ESS falls. Update i uses `fold_in(key, i)`: the same key gives
     the same network, however often training is resumed from `file`, which is refused where it was written for another
@@ -164,12 +167,8 @@ def train(
     @eqx.filter_jit
     def advance(state: _State) -> tuple[_State, Array]:
         first, last = state.update, jnp.minimum(state.update + training.interval, training.num_updates)
-        prepared = ()
-        if prepare is not None:
-            key_prepare = jr.fold_in(key, training.num_updates + first)  # no update has this number
-            prepared = (prepare(eqx.combine(state.average, static), key_prepare),)
 
-        def update(i, carry):
+        def update(prepared, i, carry):
             arrays, average, memory, losses = carry
 
             def value(arrays):
@@ -184,8 +183,18 @@ def train(
             average = jax.tree.map(lambda a, b: (kept * a + (1 - kept) * b).astype(a.dtype), average, arrays)
             return arrays, average, memory, losses.at[i - first].set(batch_loss)
 
+        def block(carry):
+            i, (arrays, average, memory, losses) = carry
+            prepared, stop = (), last
+            if prepare is not None:
+                key_prepare = jr.fold_in(key, training.num_updates + i)  # no update has this number
+                prepared = (prepare(eqx.combine(average, static), key_prepare),)
+                stop = jnp.minimum(i + _PREPARED, last)
+            carry = arrays, average, memory, losses
+            return stop, jax.lax.fori_loop(i, stop, partial(update, prepared), carry)
+
         start = state.network, state.average, state.optimizer, jnp.zeros(training.interval)
-        arrays, average, memory, losses = jax.lax.fori_loop(first, last, update, start)
+        _, (arrays, average, memory, losses) = jax.lax.while_loop(lambda carry: carry[0] < last, block, (first, start))
         new = (arrays, average, memory, last)
         where = lambda s: (s.network, s.average, s.optimizer, s.update)  # noqa: E731
         return eqx.tree_at(where, state, new), losses
