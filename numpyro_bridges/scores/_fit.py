@@ -123,8 +123,8 @@ def fit(
     - `watch`: `watch(name, guide)` is called at each look, with the guide as it then is and the history so far; `name`
       is the method's, or `"time reversal"` in the first pass of `"reversal"`.
     - `mesh`: the devices that share a batch and the held-out paths, as for `numpyro_bridges.spread`. With `draw` the
-      problems of a batch are shared, where there are equal shares of them. Of a cloud, of `"adjoint"` and `"reversal"`
-      without `draw`, they share the network's work, and each makes the cloud.
+      problems of a batch are shared, where there are equal shares of them. Of a cloud, of all methods but
+      `"residual"` without `draw`, they share the network's work, and each makes the cloud.
 
     **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is not finite ends the
     training with a warning.

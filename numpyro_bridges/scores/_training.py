@@ -29,7 +29,8 @@ class Training(eqx.Module):
 
     **Arguments:**
 
-    - `num_updates`: at most. `batch_size`: paths, or particles of a cloud, per update.
+    - `num_updates`: at most. `batch_size`: paths, or particles of a cloud, per update; of `"matching"` a quarter of the
+      paths of a cloud and a sixteenth of the points of an update.
     - `optimizer`: of optax; by default Adam with a warm-up of 50 updates and a cosine decay from `learning_rate`, the
       gradient's norm clipped to 1.
     - `average`: decay of the exponential average of the iterates, which is what is judged and returned; 0 is none. At
