@@ -95,6 +95,12 @@ COMPARISON = nb.Comparison(
         for name in "ab"
     },
 )
+TRAINED = nb.ScoreGuide(
+    nb.FrozenGuide(),
+    NETWORK,
+    STANDARD,
+    history={k: jnp.ones(2) for k in ("update", "loss", "bound", "ess", "seconds")},
+)
 ESTIMATE = nb.EvidenceEstimate(ONE, ONE, ONE, 0.1, 0.1, jnp.zeros(4))
 SPECIMEN = io.Specimen(SQUARE, id="a")
 TREE = nb.Tree.from_newick("((a:1,b:2):1,c:3);")
@@ -134,6 +140,7 @@ OBJECTS = {
     "training": TRAINING,
     "law": LAW,
     "standard": STANDARD,
+    "trained": TRAINED,
     "comparison": COMPARISON,
     "specimen": SPECIMEN,
     "tree": TREE,
@@ -142,7 +149,7 @@ OBJECTS = {
 }
 """One object of each kind; what is asked for is replaced by any of the others, or by its class."""
 
-ARE_TOO = {"sde": {"linear"}, "linear": {"sde"}}
+ARE_TOO = {"sde": {"linear"}, "linear": {"sde"}, "guide": {"trained"}}
 
 
 @dataclass
@@ -878,6 +885,7 @@ def table() -> dict[str, Row]:
             scale=("setting?", 0.1),
             closed=("flag", True),
         ),
+        "plot.training": row(plot.training, True, guides=("trained", TRAINED), file=("file", FILE)),
         "plot.tree": row(
             plot.tree,
             False,

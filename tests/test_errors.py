@@ -851,7 +851,7 @@ SCORES = [
     (
         "method",
         lambda: fitted(method="magic"),
-        "`method` must be one of .*'adjoint', 'residual', 'reversal'.*'magic'",
+        "`method` must be one of .*'adjoint', 'matching', 'residual'.*'magic'",
     ),
     (
         "adjoint-of-a-part",
@@ -877,6 +877,33 @@ SCORES = [
         "reversal-hypoelliptic",
         lambda: fitted(HYPO, method="reversal"),
         "'reversal'.*every direction.*'residual'",
+    ),
+    (
+        "matching-of-a-set",
+        lambda: fitted(condition=SET, method="matching"),
+        "'matching'.*observed value.*'residual'",
+    ),
+    (
+        "drift-that-explodes",
+        lambda: fitted(
+            nb.SDE(lambda t, x, a: 9 * x**5, lambda t, x, a: 1.0), x0=3 + X, num_steps=30
+        ),
+        "`sde` must have paths that stay finite, and 64 of 64 .*drift explodes.*Increase `num_steps`",
+    ),
+    (
+        "network-of-another-shape",
+        lambda: fitted(network=lambda t, x, v, theta: x[:2]),
+        r"`network` must be a function that takes .*x and v \(3, 1\) and theta \(0,\).*it returned \(2, 1\)",
+    ),
+    (
+        "network-of-other-arguments",
+        lambda: fitted(network=lambda t, x: x),
+        r"`network` must be a function that takes \(t, x, v, theta\).*called so it says: .*4 were given",
+    ),
+    (
+        "context-that-does-not-vary",
+        lambda: fitted(context=lambda sde: jnp.ones(1)),
+        "`context` must vary over what is drawn, .*Leave it out, or let `draw` vary it",
     ),
     (
         "guide-of-another-size",

@@ -2,12 +2,14 @@
 
 import builtins
 
+import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
 
 import numpyro_bridges as nb
 from numpyro_bridges import datasets, plot
+from numpyro_bridges.guiding._score import Standard
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
@@ -446,3 +448,32 @@ def test_deformation_refuses(shapes):
         plot.deformation(nb.KunitaFlow(nb.Landmarks(12, 3), kernel), path)
     with pytest.raises(ValueError, match="`num_lines` must be an integer, at least 2; got 1"):
         plot.deformation(nb.KunitaFlow(nb.Landmarks(12, 2), kernel), path, num_lines=1)
+
+
+def test_training(tmp_path):
+    """The network that was kept: of the best bound, but for one of less than half the ESS; what
+    follows is pale.
+    """
+    columns = {
+        "seconds": np.arange(6.0),
+        "bound": np.array([-np.inf, -3.0, -2.0, -1.0, -1.5, -0.5]),
+    }
+    columns["ess"] = np.array([0.1, 0.2, 0.5, 0.6, 0.6, 0.2])
+    guide = nb.ScoreGuide(nb.FrozenGuide(), abs, standard(), history=columns)
+    figure = plot.training({"a": guide, "b": guide}, tmp_path / "training.png")
+    assert (tmp_path / "training.png").stat().st_size > 0 and not plt.get_fignums()
+    for ax, values in zip(figure.axes, (columns["bound"], 100 * columns["ess"]), strict=True):
+        pale, whole, dot = ax.lines[:3]
+        np.testing.assert_array_equal(dot.get_xydata(), [[3.0, values[3]]])
+        assert pale.get_alpha() < 1 and len(whole.get_xdata()) == 4 and len(pale.get_xdata()) == 3
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["a", "b"]
+    with pytest.raises(
+        ValueError, match=r"`guides\['a'\]` must have a history of its training.*`nb.scores.fit`"
+    ):
+        plot.training(
+            {"a": nb.ScoreGuide(nb.FrozenGuide(), abs, standard())}, tmp_path / "never.png"
+        )
+
+
+def standard():
+    return Standard(*(jnp.ones(shape) for shape in ((), (2, 1), (2, 1), (2, 1), 0, 0)))

@@ -26,9 +26,11 @@ import numpyro_bridges as nb
 from numpyro_bridges.guiding._score import Standard
 from numpyro_bridges.scores import ScoreGuide, _training as training_module
 from numpyro_bridges.scores._clouds import (
+    _tempered,
     adjoint_cloud,
     ends,
     forward_cloud,
+    guided_cloud,
     reversal_cloud,
     reversed_bridge,
 )
@@ -120,6 +122,12 @@ def clouds(bridge, method, guide=None):
         return functools.partial(adjoint_cloud, bridge), bridge.ts[:-1]
     if method == "reversal":
         return functools.partial(reversal_cloud, bridge, guide), bridge.ts[:-1]
+    # paths of a guide that is wrong, by all of their weights; it fits ρ by itself
+    if method == "matching":
+        wrong = bridge.with_guide(
+            nb.FrozenGuide(nb.BrownianMotion(bridge.sde.covariance(0.0, bridge.x0)))
+        )
+        return lambda key, size, rho=None: guided_cloud(wrong, key, size, least=0.0), bridge.ts[:-1]
     back = reversed_bridge(bridge, bridge.end()[1])
     return functools.partial(forward_cloud, back), 1 - back.ts[:-1]
 
@@ -132,7 +140,7 @@ def mean_and_error(values):
 @pytest.mark.parametrize(
     "model, method",
     [("ou", "adjoint"), ("ou", "reversal"), ("vector", "adjoint"), ("vector", "forward"), ("geometric", "adjoint"),
-     ("geometric", "forward")],
+     ("geometric", "forward"), ("vector", "matching"), ("geometric", "matching")],
 )  # fmt: skip
 def test_targets_are_scores_on_average(model, method):
     """E (g − s) φ(x) = 0 for s the closed form and φ = 1, x: within 3 SE, and 2 % for the steps'
@@ -142,23 +150,21 @@ def test_targets_are_scores_on_average(model, method):
     """
     bridge, score, score_forward = MODELS[model]()
     make, times = clouds(bridge, method)
-    truth = score_forward if method == "forward" else score
+    # all start at x0
+    truth, first = score_forward if method == "forward" else score, int(method == "matching")
     draw = jax.jit(lambda keys, rho: jax.lax.map(lambda key: make(key, 500, rho), keys))
     fitted = jax.jit(lambda key: make(key, 500).rho)(jr.key(2))
     half = jnp.where(fitted > 0, 0.5, 0.0)  # an end that is fixed does not move
 
-    for rho in (fitted, 0 * half, half):
+    for rho in (fitted,) if method == "matching" else (fitted, 0 * half, half):
         cloud = draw(jr.split(jr.key(1), 20), rho)
-        x, g, w = (np.asarray(a) for a in (cloud.x, cloud.score, cloud.weights[..., None]))
-        np.testing.assert_allclose(np.sum(w, 2), 1.0, rtol=1e-10)
-        flat = np.moveaxis(x, 1, 0).reshape(K, -1, x.shape[-1])
-        s = np.stack(
-            [
-                truth(t, y).reshape(x[:, 0].shape)
-                for t, y in zip(np.asarray(times), flat, strict=True)
-            ],
-            1,
+        x, g, w = (
+            np.asarray(a)[:, first:] for a in (cloud.x, cloud.score, cloud.weights[..., None])
         )
+        np.testing.assert_allclose(np.sum(w, 2), 1.0, rtol=1e-10)
+        flat = np.moveaxis(x, 1, 0).reshape(K - first, -1, x.shape[-1])
+        known = zip(np.asarray(times)[first:], flat, strict=True)
+        s = np.stack([truth(t, y).reshape(x[:, 0].shape) for t, y in known], 1)
         mean = np.mean(np.sum(w * x, 2, keepdims=True), 0, keepdims=True)
         sd = np.sqrt(np.mean(np.sum(w * (x - mean) ** 2, 2, keepdims=True), 0, keepdims=True))
         gap = (g - s) * sd
@@ -201,6 +207,47 @@ def test_rho_takes_the_noise_from_the_targets():
     fitted, rho = noise(None)
     assert fitted < 1e-3 * noise(jnp.zeros(K))[0]
     np.testing.assert_allclose(rho[::-1], np.arange(K) / np.arange(1, K + 1), atol=0.06)
+
+
+# Drifts that grow faster than linearly, whose reversed processes explode.
+
+WELL = nb.SDE(lambda t, x, args: -12 * x * (x * x - 1), lambda t, x, args: 1.0)
+
+
+@pytest.mark.parametrize("method", ["adjoint", pytest.param("reversal", marks=pytest.mark.slow)])
+def test_clouds_do_not_explode(method):
+    """Between two wells, from the default guide, which is not the linearised one; without a bound
+    no loss is finite.
+    """
+    training = nb.scores.Training(4, 16, interval=2, held_out=32)
+    small = nb.scores.MLP((1, 1), key=jr.key(1), width=4, depth=1)
+    score = nb.scores.fit(
+        WELL, nb.ExactMatch().at([-1.0]), x0=[1.0], t1=1.0, num_steps=100, key=jr.key(0), method=method,
+        network=small, training=training, progress=False,
+    )  # fmt: skip
+    assert isinstance(score.guide.auxiliary, nb.BrownianMotion)
+    assert score.history["update"][-1] == 4 and np.all(np.isfinite(score.history["loss"][1:]))
+
+
+def test_a_cloud_without_particles_has_no_weight():
+    """All are killed at once where no step is short enough; the targets stay finite."""
+    bridge = nb.GuidedBridge(WELL, nb.ExactMatch().at([-0.5]), x0=[1.0], ts=TS)
+    cloud = jax.jit(lambda key: adjoint_cloud(bridge, key, 16, stride=1e-6))(jr.key(0))
+    assert (
+        not np.any(cloud.weights) and np.all(np.isfinite(cloud.score)) and np.all(cloud.x == -0.5)
+    )
+
+
+def test_weights_are_tempered_until_enough_are_left():
+    """The largest power that leaves them, 1 where it does; what is not a number has no weight."""
+    spread = jnp.append(jnp.linspace(-60.0, 0.0, 99), jnp.nan)
+    for log_weights, power in ((0.001 * spread, 1.0), (spread, None)):
+        found = np.asarray(_tempered(log_weights, 0.2))
+        assert found[-1] == -np.inf and found[-2] == 0
+        power = found[0] / log_weights[0] if power is None else power
+        np.testing.assert_allclose(found[:-1], power * log_weights[:-1], rtol=1e-6)
+        ess = float(nb.weights.effective_sample_size(found))
+        assert ess >= 20 and (power == 1 or ess < 25)
 
 
 # A weighted cloud with a rate c that varies.
@@ -471,6 +518,20 @@ def trained(training=None, key=0, loss=quadratic, judge=judged, **kwargs):
         nb.scores.Training(20, interval=5, learning_rate=0.1) if training is None else training
     )
     return train(jnp.zeros(2), loss, judge, jr.key(key), training, progress=False, **kwargs)
+
+
+def test_what_is_learned_from_is_prepared_anew(monkeypatch):
+    """After two updates, and after a look at three: 0, 2, 5, 17, 35."""
+    monkeypatch.setattr(training_module, "_PREPARED", 2)
+
+    def loss(network, key, prepared):
+        return -jnp.sum(network * prepared), network
+
+    training = nb.scores.Training(
+        6, optimizer=optax.sgd(1.0), interval=3, average=0.0, patience=None
+    )
+    network, _ = trained(training, loss=loss, prepare=lambda network, key: 1 + network)
+    np.testing.assert_allclose(network, 5 + 2 * 6 + 18)
 
 
 def test_training_goes_on_where_it_was_killed(tmp_path, monkeypatch):
@@ -922,7 +983,7 @@ def sine_evidence(ts, v=np.pi / 2):
 
 
 @pytest.mark.parametrize(
-    "method", ["residual", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)]
+    "method", ["residual", "matching", "adjoint", pytest.param("reversal", marks=pytest.mark.slow)]
 )
 def test_the_sine_bridge(method):
     """A multimodal bridge, where a Brownian guide has an ESS of 0.3 %: twenty times that; the

@@ -14,4 +14,5 @@ from ._shapes import (
     path as path,
     score_field as score_field,
 )
+from ._training import training as training
 from ._tree import tree as tree

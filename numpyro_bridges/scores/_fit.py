@@ -1,6 +1,8 @@
-"""Training of learned guides: what is the same for every method, and the three methods.
+"""Training of learned guides: what is the same for every method, and the four methods.
 
 - `residual`: the evidence bound E log w is maximised (Yang, van der Meulen and Sommer 2025).
+- `matching`: score matching on weighted paths of the guide as it learns (Domingo-Enrich, Han, Amos,
+  Bruna and Chen 2024).
 - `adjoint`: score matching on the weighted reversed process from the observation (Baker, Schauer
   and Sommer 2025).
 - `reversal`: score matching of the unconditioned process gives the time reversal; score matching on
@@ -39,13 +41,14 @@ from ..guiding import (
     Unguided,
     default_guide,
 )
-from ..sdes import AbstractSDE, BrownianMotion
+from ..sdes import AbstractSDE, BrownianMotion, LinearSDE
 from ..spaces import Landmarks
 from ._clouds import (
     Cloud,
     adjoint_cloud,
     ends,
     forward_cloud,
+    guided_cloud,
     reversal_cloud,
     reversed_bridge,
     whiten,
@@ -54,6 +57,9 @@ from ._networks import MLP, ROWWISE, PointNetwork, over_batch
 from ._training import Training, train
 
 _LEAST_HELD_OUT = 16  # independent differences: with fewer their standard error is itself unknown
+_STRIDE = 0.5  # of clouds, in the largest displacement of the guide's paths
+# of a cloud and of an update for one of a batch, in `matching`; problems
+_PATHS, _POINTS, _MATCHED = 4, 16, 16
 
 Draw = Callable[[PRNGKeyArray], tuple[AbstractSDE, AbstractCondition, State]]
 
@@ -67,6 +73,8 @@ class Problem(NamedTuple):
     training: Training
     train: Callable
     mesh: Mesh | None = None
+    stride: Array | float = jnp.inf
+    """Of the clouds, see `_clouds`."""
 
     def spread(self, fn: Callable, size: int) -> Callable:
         """`fn` for a batch of a size; whole on each device where that has no equal shares."""
@@ -109,10 +117,14 @@ def fit(
 
     **Arguments:**
 
-    - `sde`, `condition`, `x0`, `t1`, `t0`, `num_steps` (100 by default), `ts`, `guide`: as for
-      `GuidedBridge`. `guide=Unguided()` learns all of ∇log h from nothing.
-    - `method`: `"residual"` (any SDE and condition), `"adjoint"` (an observation of the whole
-      state) or `"reversal"` (an observed value); the latter two need noise in every direction.
+    - `sde`, `condition`, `x0`, `t1`, `t0`, `num_steps` (100 by default), `ts`: as for
+      `GuidedBridge`.
+    - `guide`: the guide that is corrected; by default that of `GuidedBridge`, or where a is
+      constant and the drift not linear Brownian motion's, if that has the higher bound and the
+      higher ESS on 256 paths. `Unguided()` learns all of ∇log h from nothing.
+    - `method`: `"residual"` (any SDE and condition), `"matching"` or `"reversal"` (an observed
+      value), or `"adjoint"` (an observation of the whole state); all but the first need noise in
+      every direction.
     - `network`: `network(t, x, v, theta)`, see `ScoreGuide`; by default a `PointNetwork` for
       landmarks, an `MLP` else.
     - `training`: a `Training`.
@@ -127,7 +139,7 @@ def fit(
       `"reversal"`.
     - `mesh`: the devices that share a batch and the held-out paths, as for
       `numpyro_bridges.spread`. With `draw` the problems of a batch are shared, where there are
-      equal shares of them. Of a cloud, of `"adjoint"` and `"reversal"` without `draw`, they share
+      equal shares of them. Of a cloud, of all methods but `"residual"` without `draw`, they share
       the network's work, and each makes the cloud.
 
     **Errors:** `ValueError` for what a method cannot do, with the method that can. A loss that is
@@ -147,6 +159,7 @@ def fit(
         "use the default guide.",
     )
     training = Training() if training is None else training
+    bridge = _better(bridge, key) if guide is None else bridge
     require_instance(training, Training, "training", "a `Training(...)`")
     for name, function, meant in (
         ("context", context, "of the SDE"),
@@ -175,10 +188,13 @@ def fit(
             network = PointNetwork(dim, size, key=key_network)
         else:
             network = MLP((n, dim), size, key=key_network)
+    start, stride = _untrained(
+        network, draw_bridge, context, key_pilot, lambda bridge: bridge.end()[1]
+    )
     problem = Problem(
         draw_bridge,
         draw is not None,
-        _untrained(network, draw_bridge, context, key_pilot, lambda bridge: bridge.end()[1]),
+        start,
         training,
         partial(
             _train,
@@ -189,8 +205,33 @@ def fit(
             mesh=mesh,
         ),
         mesh,
+        stride,
     )
     return METHODS[method](problem, key_train)
+
+
+def _better(bridge: GuidedBridge, key: PRNGKeyArray, num_paths: int = 256) -> GuidedBridge:
+    """With the default guide, or with one that knows no drift where that has the higher bound and
+    the higher ESS.
+
+    A drift linearised at the end misleads where it is not nearly linear on the way: paths between
+    two wells.
+    """
+    known = isinstance(
+        bridge.sde, (LinearSDE, BrownianMotion)
+    ) or not bridge.sde.has_constant_covariance(bridge.x0)
+    if known or bridge.condition.num_extra_noises or not _has_noise(bridge):
+        return bridge
+    noise = jr.normal(key, (num_paths, *bridge.noise_shape), bridge.x0.dtype)
+
+    @eqx.filter_jit
+    def judged(bridge):
+        log_weights = jax.vmap(bridge.log_weight)(noise)
+        return jnp.mean(log_weights), weights.effective_sample_size(log_weights)
+
+    plain = bridge.with_guide(_driftless(bridge))
+    (bound, ess), (plain_bound, plain_ess) = judged(bridge), judged(plain)
+    return plain if plain_bound > bound and plain_ess > ess else bridge
 
 
 def residual(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
@@ -214,6 +255,52 @@ def residual(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     return problem.train(problem, loss, _judge(problem, key_judge), key, "residual")
 
 
+def matching(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
+    """Score matching on weighted paths of the guide as it learns, which are drawn anew as it does."""
+    bridge = problem.draw(key)
+    _need_noise(bridge, "matching")
+    _need_value(bridge, "matching")
+    key_judge, key = jr.split(key)
+    draws = _MATCHED if problem.amortised else 1
+    num_paths, num_points = (
+        -(-n * problem.training.batch_size // draws) for n in (_PATHS, _POINTS)
+    )
+    num_paths = max(num_paths, _LEAST_HELD_OUT)  # their weights are among themselves
+
+    def prepare(network, key):
+        def one(key):
+            key_draw, key_cloud = jr.split(key)
+            bridge = problem.draw(key_draw)
+            led = bridge.with_guide(replace(problem.guide, network=network))
+            cloud = guided_cloud(led, key_cloud, num_paths)
+            _, displacements, targets = _lacking(problem, network, bridge, cloud)
+            return key_draw, displacements, cloud.x, targets, cloud.weights[0]
+
+        return problem.spread(one, draws)(jr.split(key, draws))
+
+    def rows(network, key, prepared):
+        key_draw, displacements, states, targets, weights = prepared
+        bridge = problem.draw(key_draw)
+        plan = _plan(problem, network, bridge)
+        key_step, key_path = jr.split(key)
+        k = jr.choice(key_step, bridge.num_steps, (num_points,), p=jnp.diff(bridge.grid.elapsed))
+        i = jr.choice(key_path, weights.size, (num_points,), p=weights)
+        states, targets, ts = states[k, i], targets[k, i], bridge.shown_ts[k]
+
+        def error(output):
+            def one(t, x, f, target):
+                return jnp.sum(whiten(bridge, t, x, plan.score(f, x) - target) ** 2)
+
+            return jnp.mean(jax.vmap(one)(ts, states, output, targets))
+
+        return jax.vmap(plan.inputs, (0, 0), ROWWISE)(plan.steps[1][k], displacements[k, i]), error
+
+    loss = _regression(problem, rows, draws)
+    return problem.train(
+        problem, loss, _judge(problem, key_judge), key, "matching", prepare=prepare
+    )
+
+
 def adjoint(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     """Score matching on the reversed process from the observation."""
     bridge = problem.draw(key)
@@ -227,7 +314,10 @@ def adjoint(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
         "part of it free. Use `method='residual'`.",
     )
     key_judge, key_pilot, key = jr.split(key, 3)
-    loss = _regression(problem, adjoint_cloud, _coefficients(problem, adjoint_cloud, key_pilot))
+    make = partial(adjoint_cloud, stride=problem.stride)
+    loss = _regression(
+        problem, _clouds(problem, make, _coefficients(problem, make, key_pilot)), _draws(problem)
+    )
     return problem.train(problem, loss, _judge(problem, key_judge), key, "adjoint")
 
 
@@ -235,11 +325,7 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     """Score matching of the unconditioned process, and of its reversals from the observation."""
     bridge = problem.draw(key)
     _need_noise(bridge, "reversal")
-    require(
-        bridge.condition.num_extra_noises == 0,
-        "`method='reversal'` needs an observed value, and this condition is a set. Use "
-        "`method='residual'`.",
-    )
+    _need_value(bridge, "reversal")
     key_standard, key_pilots, key_judges, key_first, key_second = jr.split(key, 5)
     (key_pilot, key_pilot_2), (key_judge, key_judge_2) = jr.split(key_pilots), jr.split(key_judges)
 
@@ -249,18 +335,21 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
         return reversed_bridge(bridge, ends(bridge, key_end, 1)[0], guide(bridge))
 
     context, network = problem.guide.context, problem.guide.network
-    start = _untrained(network, problem.draw, context, key_standard, lambda bridge: bridge.x0)
+    start, stride = _untrained(
+        network, problem.draw, context, key_standard, lambda bridge: bridge.x0
+    )
+    forward = partial(forward_cloud, stride=stride)
     start = replace(start, context=None if context is None else lambda sde: context(sde.sde))
     unguided = isinstance(bridge.guide, Unguided)
     draws = [
         partial(draw_back, guide=g)
         for g in ([lambda _: Unguided()] if unguided else [_linearised, _driftless])
     ]
-    rho = _coefficients(problem._replace(draw=draws[0]), forward_cloud, key_pilot)
+    rho = _coefficients(problem._replace(draw=draws[0]), forward, key_pilot)
 
     def candidate(draw):
         back = problem._replace(draw=draw, guide=replace(start, guide=draw(key).guide))
-        loss = _regression(back, forward_cloud, rho)
+        loss = _regression(back, _clouds(back, forward, rho), _draws(back))
 
         @eqx.filter_jit
         def judge(network):
@@ -273,9 +362,10 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     reverse = problem.train(back, loss, judge, key_first, "time reversal")
 
     def cloud(bridge, key, size, rho=None):
-        return reversal_cloud(bridge, reverse, key, size, rho)
+        return reversal_cloud(bridge, reverse, key, size, rho, stride=problem.stride)
 
-    loss = _regression(problem, cloud, _coefficients(problem, cloud, key_pilot_2))
+    rho = _coefficients(problem, cloud, key_pilot_2)
+    loss = _regression(problem, _clouds(problem, cloud, rho), _draws(problem))
     found = problem.train(problem, loss, _judge(problem, key_judge_2), key_second, "reversal")
     seconds = found.history["seconds"] + reverse.history["seconds"][-1]
     return replace(found, history=found.history | {"seconds": seconds})
@@ -290,11 +380,22 @@ def _driftless(bridge: GuidedBridge) -> AbstractGuide:
     return FrozenGuide(BrownianMotion(bridge.sde.covariance(bridge.clock, bridge.x0)))
 
 
-METHODS = {"residual": residual, "adjoint": adjoint, "reversal": reversal}
+METHODS = {"residual": residual, "matching": matching, "adjoint": adjoint, "reversal": reversal}
 
 
 def _train(
-    problem: Problem, loss, judge, key, name, *, given, directory, progress, watch, mesh
+    problem: Problem,
+    loss,
+    judge,
+    key,
+    name,
+    *,
+    given,
+    directory,
+    progress,
+    watch,
+    mesh,
+    prepare=None,
 ) -> ScoreGuide:
     def guide(network, history):
         return replace(problem.guide, network=network, history=history)
@@ -317,6 +418,7 @@ def _train(
         if watch is None
         else lambda network, history: watch(name, guide(network, history)),
         mesh=mesh,
+        prepare=prepare,
     )
     return guide(network, history | _gain(name, judged(problem.guide.network), judged(network)))
 
@@ -380,56 +482,79 @@ def _draws(problem: Problem) -> int:
     return 4 if problem.amortised else 1
 
 
-def _regression(problem: Problem, make: Callable[..., Cloud], rho: Array):
-    """The loss of score matching, ∫ E |s − (g − ∇log h̃)|²_a dt / T, on clouds."""
-    size, draws = problem.training.batch_size, _draws(problem)
+def _clouds(problem: Problem, make: Callable[..., Cloud], rho: Array) -> Callable:
+    """Rows of all points of a cloud that is drawn for each update."""
+    size = -(-problem.training.batch_size // _draws(problem))
 
     def rows(network, key):
         key_draw, key_cloud = jr.split(key)
         bridge = problem.draw(key_draw)
-        cloud = make(bridge, key_cloud, -(-size // draws), rho)
-        guide = replace(problem.guide, network=network)
-        led = bridge.with_guide(guide).problem()
-        frame, condition, seen, reference, ts = led
-        plan = bridge.plan(guide, led)
-        assert isinstance(plan, ScorePlan)
-        observed = bridge.observed() - apply(seen.operator, frame.origins[-1])
-        displacements = cloud.x - frame.origins[:-1, None]
-
-        def lacking(step, t, x, g):
-            base = plan.base.message(step[0], frame.sde, t, x, observed).score(x)
-            return g - base - plan.base.correction(step[0], x)
-
-        each = jax.vmap(jax.vmap(lacking, (None, None, 0, 0)))
-        target = each(plan.steps, ts[:-1], displacements, cloud.score)
+        cloud = make(bridge, key_cloud, size, rho)
+        plan, displacements, targets = _lacking(problem, network, bridge, cloud)
         each_inputs = jax.vmap(plan.inputs, (None, 0), ROWWISE)
-        inputs = jax.vmap(each_inputs, (0, 0), ROWWISE)(plan.steps[1], displacements)
+        t, x, v, theta = jax.vmap(each_inputs, (0, 0), ROWWISE)(plan.steps[1], displacements)
 
         def error(output):
             def one(t, x, f, target):
                 return jnp.sum(whiten(bridge, t, x, plan.score(f, x) - target) ** 2)
 
+            output = output.reshape(*t.shape, *output.shape[1:])
             squares = jax.vmap(jax.vmap(one, (None, 0, 0, 0)))(
-                bridge.shown_ts[:-1], cloud.x, output, target
+                bridge.shown_ts[:-1], cloud.x, output, targets
             )
-            dt = jnp.diff(ts)
+            dt = jnp.diff(bridge.grid.elapsed)
             return jnp.sum(dt[:, None] * cloud.weights * squares) / jnp.sum(dt)
 
-        return inputs, error
+        return (t.ravel(), x.reshape(t.size, *x.shape[2:]), v, theta), error
 
-    def loss(network, key):
+    return rows
+
+
+def _lacking(
+    problem: Problem, network, bridge: GuidedBridge, cloud: Cloud
+) -> tuple[ScorePlan, Array, Array]:
+    """The plan, the points of a cloud as displacements, and what the guide lacks there, g − ∇log
+    h̃.
+    """
+    led = bridge.problem()
+    frame, _, seen, _, ts = led
+    plan = _plan(problem, network, bridge)
+    observed = bridge.observed() - apply(seen.operator, frame.origins[-1])
+    displacements = cloud.x - frame.origins[:-1, None]
+
+    def lacking(step, t, x, g):
+        base = plan.base.message(step[0], frame.sde, t, x, observed).score(x)
+        return g - base - plan.base.correction(step[0], x)
+
+    each = jax.vmap(jax.vmap(lacking, (None, None, 0, 0)))
+    return plan, displacements, each(plan.steps, ts[:-1], displacements, cloud.score)
+
+
+def _plan(problem: Problem, network, bridge: GuidedBridge) -> ScorePlan:
+    guide = replace(problem.guide, network=network)
+    plan = bridge.plan(guide, bridge.with_guide(guide).problem())
+    assert isinstance(plan, ScorePlan)
+    return plan
+
+
+def _regression(problem: Problem, rows: Callable, draws: int):
+    """The loss of score matching, ∫ E |s − (g − ∇log h̃)|²_a dt / T.
+
+    `rows(network, key, *prepared)` are the inputs of the network and the loss as a function of its
+    outputs; `prepared` has an entry for each of the problems that are drawn.
+    """
+
+    def loss(network, key, *prepared):
         if draws == 1:
-            inputs, error = rows(network, key)
-            t, x, v, theta = inputs
-            states = x.reshape(t.size, *x.shape[2:])
-            output, network = over_batch(network, t.ravel(), states, v, theta, problem.spread)
-            return error(output.reshape(*t.shape, *output.shape[1:])), network
+            (t, x, v, theta), error = rows(network, key, *jax.tree.map(lambda a: a[0], prepared))
+            output, network = over_batch(network, t, x, v, theta, problem.spread)
+            return error(output), network
 
-        def one(key):
-            inputs, error = rows(network, key)
-            return error(jax.vmap(jax.vmap(network, ROWWISE), ROWWISE)(*inputs))
+        def one(key, *prepared):
+            inputs, error = rows(network, key, *prepared)
+            return error(jax.vmap(network, ROWWISE)(*inputs))
 
-        return jnp.mean(problem.spread(one, draws)(jr.split(key, draws))), network
+        return jnp.mean(problem.spread(one, draws)(jr.split(key, draws), *prepared)), network
 
     return loss
 
@@ -470,10 +595,13 @@ def _judge(problem: Problem, key: PRNGKeyArray):
     return judge
 
 
-def _untrained(network, draw, context, key, target, num_paths: int = 64) -> ScoreGuide:
+def _untrained(
+    network, draw, context, key, target, num_paths: int = 64
+) -> tuple[ScoreGuide, Array]:
     """The guide with its network as it is, standardised on paths of the guide that it corrects.
 
-    `target(bridge)` is the v of which x − v is the displacement.
+    `target(bridge)` is the v of which x − v is the displacement. And the stride of clouds,
+    `_STRIDE` times the largest displacement of these paths.
     """
 
     def one(key):
@@ -486,6 +614,13 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> Scor
 
     paths, v, theta = jax.jit(jax.vmap(one))(jr.split(key, num_paths))
     bridge = draw(key)
+    lost = int(jnp.sum(~jnp.all(jnp.isfinite(paths), axis=(1, 2, 3))))
+    require(
+        lost == 0,
+        f"`sde` must have paths that stay finite, and {lost} of {num_paths} led by the guide do "
+        "not: its drift "
+        "explodes, or a step is too long for it. Increase `num_steps`, or give another `guide`.",
+    )
     duration = bridge.grid.elapsed[-1]
     pooled = isinstance(bridge.sde.space, Landmarks)
     away = jnp.mean((paths - v[:, None]) ** 2, axis=(0, 1))
@@ -501,23 +636,59 @@ def _untrained(network, draw, context, key, target, num_paths: int = 64) -> Scor
     scale = jnp.sqrt(away)
     scale = jnp.where(scale > 1e-6 * jnp.max(scale), scale, 1.0)
     deviation = jnp.std(theta, axis=0)
-    standard = Standard(
-        duration,
-        scale,
-        centre,
-        width,
-        jnp.mean(theta, axis=0),
-        jnp.where(deviation > 0, deviation, 1.0),
+    still = np.flatnonzero(deviation <= 1e-6 * jnp.abs(jnp.mean(theta, axis=0)))
+    require(
+        still.size == 0,
+        f"`context` must vary over what is drawn, and its number {still[:1]} is "
+        f"{theta[0, still[:1]]} in all of "
+        f"{num_paths} problems: a network cannot learn from it. Leave it out, or let `draw` vary "
+        "it.",
     )
-    return ScoreGuide(bridge.guide, network, standard, context)
+    standard = Standard(duration, scale, centre, width, jnp.mean(theta, axis=0), deviation)
+    guide = ScoreGuide(bridge.guide, network, standard, context)
+    _check_output(guide, bridge)
+    return guide, _STRIDE * jnp.max(jnp.abs(paths - v[:, None]))
+
+
+def _check_output(guide: ScoreGuide, bridge: GuidedBridge) -> None:
+    """`ValueError` where a network does not fit states shaped like those of the bridge."""
+    shape = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
+    state = jnp.zeros(shape, bridge.x0.dtype)
+    inputs = (jnp.zeros((), state.dtype), state, state, guide.standard.context_mean)
+    words = f"takes (t, x, v, theta) with x and v {shape} and theta {inputs[3].shape}, and returns an array like x"
+    try:
+        found = jax.eval_shape(lambda: guide.network(*inputs))
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"`network` must be a function that {words}; called so it says: {error}."
+        ) from error
+    output = getattr(found, "shape", None)
+    require(
+        output == shape,
+        f"`network` must be a function that {words}; it returned {output or found}.",
+    )
+
+
+def _need_value(bridge: GuidedBridge, method: str) -> None:
+    require(
+        bridge.condition.num_extra_noises == 0,
+        f"`method={method!r}` needs an observed value, and this condition is a set. Use "
+        "`method='residual'`.",
+    )
 
 
 def _need_noise(bridge: GuidedBridge, method: str) -> None:
+    require(
+        _has_noise(bridge),
+        f"`method={method!r}` needs noise in every direction, and a(t0, x0) is singular. Use "
+        "`method='residual'`.",
+    )
+
+
+def _has_noise(bridge: GuidedBridge) -> bool:
+    """Whether there is noise in every direction at the start, as far as that is known."""
     a = bridge.sde.covariance(bridge.clock, bridge.x0)
-    if concrete(a) is not None:
-        pivots = jnp.diagonal(jnp.linalg.cholesky(a)) if a.ndim == 2 else jnp.atleast_1d(a)
-        require(
-            jnp.all(pivots > 0),
-            f"`method={method!r}` needs noise in every direction, and a(t0, x0) is singular. Use "
-            "`method='residual'`.",
-        )
+    if concrete(a) is None:
+        return True
+    pivots = jnp.diagonal(jnp.linalg.cholesky(a)) if a.ndim == 2 else jnp.atleast_1d(a)
+    return bool(jnp.all(pivots > 0))

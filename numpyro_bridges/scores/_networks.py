@@ -47,13 +47,16 @@ class MLP(eqx.Module):
         self.num_times, size = 4, _size(shape)
         context = positive_integer(context, "context", least=0)
         width, depth = positive_integer(width, "width"), positive_integer(depth, "depth", least=0)
-        layers = eqx.nn.MLP(2 * size + context + 8 + 2, size, width, depth, jax.nn.silu, key=key)
+        layers = eqx.nn.MLP(3 * size + context + 8 + 3, size, width, depth, jax.nn.silu, key=key)
         self.layers = eqx.tree_at(lambda m: m.layers[-1], layers, replace_fn=_zero)
 
     def __call__(self, t, x: State2, v: State2, theta: Float[Array, " c"]) -> State2:
-        left = jnp.stack([t, jnp.sqrt(jnp.maximum(1 - t, 0))])
-        features = [x.ravel(), v.ravel(), theta, left, time_features(t, self.num_times)]
-        return self.layers(jnp.concatenate(features).astype(x.dtype)).reshape(x.shape)
+        left = jnp.maximum(1 - t, 0)
+        near = jnp.arcsinh(x.ravel() / jnp.sqrt(left + 1e-3))
+        times = jnp.stack([t, jnp.sqrt(left), jnp.log(left + 1e-3) / 3])
+        features = [x.ravel(), near, v.ravel(), theta, times, time_features(t, self.num_times)]
+        output = self.layers(jnp.concatenate(features).astype(x.dtype)).reshape(x.shape)
+        return output / jnp.sqrt(left + 0.01).astype(x.dtype)
 
 
 class PointNetwork(eqx.Module):

@@ -7,6 +7,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,13 @@ class Training(eqx.Module):
 
     **Arguments:**
 
-    - `num_updates`: at most. `batch_size`: paths, or particles of a cloud, per update.
+    - `num_updates`: at most. `batch_size`: paths, or particles of a cloud, per update; of
+      `"matching"` a quarter of the paths of a cloud and a sixteenth of the points of an update.
     - `optimizer`: of optax; by default Adam with a warm-up of 50 updates and a cosine decay from
       `learning_rate`, the gradient's norm clipped to 1.
     - `average`: decay of the exponential average of the iterates, which is what is judged and
-      returned; 0 is none.
+      returned; 0 is none. At update i it is (1 + i)/(10 + i) if that is less, so that the start is
+      soon forgotten.
     - `interval`: updates between looks at the held-out paths. `held_out`: their number.
     - `patience`: looks without a better bound after which training stops; `None` does not stop and
       keeps the last network in place of the best.
@@ -60,7 +63,7 @@ class Training(eqx.Module):
         *,
         learning_rate: float = 2e-3,
         optimizer: optax.GradientTransformation | None = None,
-        average: float = 0.98,
+        average: float = 0.99,
         interval: int = 100,
         held_out: int = 256,
         patience: int | None = 5,
@@ -123,7 +126,8 @@ class _State(eqx.Module):
     history: dict[str, Array]
 
 
-Loss = Callable[[Any, PRNGKeyArray], tuple[Array, Any]]
+Loss = Callable[..., tuple[Array, Any]]
+_PREPARED = 25  # updates, for which what is prepared serves
 Judge = Callable[[Any], tuple[Array, ...]]
 
 
@@ -140,19 +144,21 @@ def train(
     progress: bool = True,
     watch: Callable[[Any, dict[str, Array]], None] | None = None,
     mesh: Mesh | None = None,
+    prepare: Callable[[Any, PRNGKeyArray], Any] | None = None,
 ) -> tuple[Any, dict[str, Array]]:
     """The best network, and the history.
 
-    `loss(network, key)` gives the loss of a batch and the network with its own state renewed;
-    `judge(network)`, compiled, a value to be maximised, the bound and the ESS fraction on held-out
-    paths, and what else it likes. A network of a better value is kept unless its ESS is less than
-    half of that of the one kept before: the bound E log w is little moved by large weights, and may
-    rise where the ESS falls. Update i uses `fold_in(key, i)`: the same key gives the same network,
-    however often training is resumed from `file`, which is refused where it was written for another
-    `problem` (a pytree of arrays), another key or other settings. `watch(network, history)` is
-    called at each look with the network that was looked at. Seconds are of the updates, compilation
-    apart. The file is written by the first process of `mesh`, over which the loss spreads its
-    paths.
+    `loss(network, key)` gives the loss of a batch and the network with its own state renewed; with
+    `prepare` it is `loss(network, key, prepared)`, where `prepare(network, key)` is called after
+    each look and 25 updates, with the average. `judge(network)`, compiled, gives a value to be
+    maximised, the bound and the ESS fraction on held-out paths, and what else it likes. A network
+    of a better value is kept unless its ESS is less than half of that of the one kept before: the
+    bound E log w is little moved by large weights, and may rise where the ESS falls. Update i uses
+    `fold_in(key, i)`: the same key gives the same network, however often training is resumed from
+    `file`, which is refused where it was written for another `problem` (a pytree of arrays),
+    another key or other settings. `watch(network, history)` is called at each look with the network
+    that was looked at. Seconds are of the updates, compilation apart. The file is written by the
+    first process of `mesh`, over which the loss spreads its paths.
     """
     optimizer, decay = training.optimizer, training.average
     looks = -(-training.num_updates // training.interval) + 1
@@ -177,22 +183,39 @@ def train(
             jnp.minimum(state.update + training.interval, training.num_updates),
         )
 
-        def update(i, carry):
+        def update(prepared, i, carry):
             arrays, average, memory, losses = carry
 
             def value(arrays):
-                loss_value, renewed = loss(eqx.combine(arrays, static), jr.fold_in(key, i))
+                loss_value, renewed = loss(
+                    eqx.combine(arrays, static), jr.fold_in(key, i), *prepared
+                )
                 return loss_value, eqx.filter(renewed, eqx.is_inexact_array)
 
             (batch_loss, renewed), gradient = jax.value_and_grad(value, has_aux=True)(arrays)
             with jax.numpy_dtype_promotion("standard"):  # optax needs it
                 steps, memory = optimizer.update(gradient, memory, renewed)
                 arrays = optax.apply_updates(renewed, steps)
-            average = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, average, arrays)
+            kept = jnp.minimum(decay, (1 + i) / (10 + i))
+            average = jax.tree.map(
+                lambda a, b: (kept * a + (1 - kept) * b).astype(a.dtype), average, arrays
+            )
             return arrays, average, memory, losses.at[i - first].set(batch_loss)
 
+        def block(carry):
+            i, (arrays, average, memory, losses) = carry
+            prepared, stop = (), last
+            if prepare is not None:
+                key_prepare = jr.fold_in(key, training.num_updates + i)  # no update has this number
+                prepared = (prepare(eqx.combine(average, static), key_prepare),)
+                stop = jnp.minimum(i + _PREPARED, last)
+            carry = arrays, average, memory, losses
+            return stop, jax.lax.fori_loop(i, stop, partial(update, prepared), carry)
+
         start = state.network, state.average, state.optimizer, jnp.zeros(training.interval)
-        arrays, average, memory, losses = jax.lax.fori_loop(first, last, update, start)
+        _, (arrays, average, memory, losses) = jax.lax.while_loop(
+            lambda carry: carry[0] < last, block, (first, start)
+        )
         new = (arrays, average, memory, last)
         where = lambda s: (s.network, s.average, s.optimizer, s.update)  # noqa: E731
         return eqx.tree_at(where, state, new), losses
