@@ -256,7 +256,7 @@ def residual(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
 
 
 def matching(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
-    """Score matching on weighted paths of the guide as it learns, which are drawn anew as it does."""
+    """Score matching on weighted paths of the guide as it learns, which are drawn anew then."""
     bridge = problem.draw(key)
     _need_noise(bridge, "matching")
     _need_value(bridge, "matching")
@@ -655,7 +655,10 @@ def _check_output(guide: ScoreGuide, bridge: GuidedBridge) -> None:
     shape = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
     state = jnp.zeros(shape, bridge.x0.dtype)
     inputs = (jnp.zeros((), state.dtype), state, state, guide.standard.context_mean)
-    words = f"takes (t, x, v, theta) with x and v {shape} and theta {inputs[3].shape}, and returns an array like x"
+    words = (
+        f"takes (t, x, v, theta) with x and v {shape} and theta {inputs[3].shape}, and returns "
+        "an array like x"
+    )
     try:
         found = jax.eval_shape(lambda: guide.network(*inputs))
     except (TypeError, ValueError) as error:
