@@ -1,9 +1,9 @@
 """Results for ArviZ: 0.x, an `InferenceData`, and 1.x, a `DataTree`.
 
 The driving noise is left out: thousands of numbers, none of them of interest. The log likelihood is that of
-`log_likelihood`, with noise and effects of a unit integrated out. What is conditional on them, log p(v_i | z, u, θ), has
-the same harmonic mean over the posterior; but that is a mean of weights whose spread grows with what the datum says of
-z and u, and leave-one-out by it is off by many nats.
+`log_likelihood`, with noise and effects of a unit integrated out. What is conditional on them, log p(v_i | z, u, θ),
+has the same harmonic mean over the posterior; but that is a mean of weights whose spread grows with what the datum says
+of z and u, and leave-one-out by it is off by many nats.
 """
 
 import warnings

@@ -6,6 +6,7 @@ import numpyro
 from numpyro.distributions import ExpandedDistribution, Independent, MaskedDistribution
 from numpyro.infer import MCMC
 
+from .. import weights
 from .._checks import require, require_instance
 from ..distributions import AbstractNoiseDriven
 
@@ -67,3 +68,10 @@ def mask_of(law):
     inside = inner.shape[len(law.base_dist.batch_shape) :]
     own = own.reshape(own.shape + (1,) * len(inside))
     return jnp.broadcast_to(inner & own, law.batch_shape + inside)
+
+
+def surely_heavy(k, num_particles):
+    """Whether k̂ is above the threshold by two standard errors: of many data one is above it by chance."""
+    k = np.clip(k, 0.0, 2.0)
+    error = (1 + k) / np.sqrt(3 * np.sqrt(num_particles))
+    return k - 2 * error >= weights.pareto_k_threshold(num_particles)

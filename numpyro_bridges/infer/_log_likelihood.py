@@ -19,6 +19,7 @@ relative variance of p̂. Where the run has not kept the noise, fresh points are
 
 import math
 import warnings
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -36,13 +37,15 @@ from .. import weights
 from .._checks import positive_integer, require_key
 from .._devices import gather, spread
 from ..distributions import DiffusionTree
-from ._draws import is_datum, mask_of, model_of, spaced, with_noise
+from ._draws import is_datum, mask_of, model_of, spaced, surely_heavy, with_noise
 from ._posterior import Sites, is_latent, is_noise, sites_of
-from ._reference import from_moments
+from ._reference import Reference, from_moments, if_finite
 
 _DRAWS = 200
 _LEAST_PARTICLES = 8
-"""Fewer have no median to which weights can be compared."""
+"""Fewer have no mean to which one of them can be compared."""
+_EQUAL = 0.01
+"""Logarithms of weights that differ by less, from those of the others, are equal."""
 _FROM_PRIOR = 0.2
 """Of the points of u: their weights are at most 5 times the likelihood, whatever the fit."""
 _TAILS = 5
@@ -55,7 +58,7 @@ class LogLikelihood(NamedTuple):
     - `values`: by site, `(chains, draws, *data)`.
     - `standard_error`: by site, `(*data)`: of the value at one draw, in nats, from the fresh weights. Averages over
       draws have far less. 0 where nothing was integrated.
-    - `pareto_k`: by site, `(*data)`: k̂ of the fresh weights of all draws, each relative to the median of its draw.
+    - `pareto_k`: by site, `(*data)`: k̂ of the fresh weights of all draws, each relative to the mean of the others.
       -inf where nothing was integrated.
     - `sites`: by name, the observed sites that are left out together, mostly one.
     - `draws`: which of each chain. `num_particles`: K.
@@ -104,7 +107,8 @@ def log_likelihood(
     are sites that need what the run has not kept, other than the noise and the effects of data, and, with a warning,
     data in a `scan` that noise drives.
 
-    **Errors:** `ValueError` for a kernel without a model. `UserWarning` where a k̂ reaches `pareto_k_threshold`.
+    **Errors:** `ValueError` for a kernel without a model. `UserWarning` where a k̂ is above `pareto_k_threshold` by two
+    standard errors: of many data some k̂ are large by chance.
 
     **Source:** [@vehtari2016] for integrated leave-one-out; [@merkle2019] for what the conditional one answers.
     """
@@ -148,7 +152,7 @@ def log_likelihood(
         log_weights = np.moveaxis(np.asarray(log_weights), 1, -1)  # (draws, *data, K)
         mean = np.asarray(weights.log_mean_exp(log_weights))
         values[name] = mean.reshape(chains, len(places), *mean.shape[1:])
-        errors[name], shapes[name] = _quality(log_weights[..., int(own) :], num_particles)
+        errors[name], shapes[name] = _quality(log_weights, int(own))
     _warn_of_tails(shapes, num_particles * len(chosen))
     together = {part.name: part.sites for part in parts}
     return LogLikelihood(values, errors, shapes, together, numbers[places], num_particles)
@@ -277,7 +281,12 @@ def _fitted(part: _Part, samples, sites, replay):
         explained = g @ jnp.linalg.lstsq(g, rest.reshape(size, -1))[0]
         rest = rest - explained.reshape(rest.shape)
     squares = jnp.einsum("s...d,s...e->...de", rest, rest)
-    factor = jnp.vectorize(lambda mean, m2: from_moments(mean, m2, size).scale, signature="(d),(d,d)->(d,d)")
+
+    @partial(jnp.vectorize, signature="(d),(d,d)->(d,d)")
+    def factor(mean, squares):
+        """1 where draws do not vary: any will do, since points have weights."""
+        return if_finite(from_moments(mean, squares, size), Reference(mean, jnp.eye(mean.size))).scale
+
     return effects - rest, factor(mean, squares)
 
 
@@ -358,25 +367,31 @@ def _rows_of_tips(blocks):
     return np.repeat([block not in inner for block in range(len(blocks.sizes))], blocks.sizes)
 
 
-def _quality(log_weights, num_particles):
-    """Standard error at one draw, and k̂, from fresh weights `(draws, *data, K)`."""
-    middle = np.median(log_weights, axis=-1, keepdims=True)
-    middle = np.where(np.isfinite(middle), middle, np.max(log_weights, axis=-1, keepdims=True))
-    relative = log_weights - np.where(middle == -np.inf, 0.0, middle)
-    relative = np.moveaxis(relative, 0, -1).reshape(*log_weights.shape[1:-1], -1)
-    size = relative.shape[-1]
-    variance = size / np.asarray(weights.effective_sample_size(relative)) - 1
-    return np.sqrt(np.maximum(variance, 0.0) / num_particles), np.asarray(weights.pareto_k(relative))
+def _quality(log_weights, own):
+    """Standard error at one draw, and k̂, of weights `(draws, *data, K)`; `own`: the first is not new."""
+    size = log_weights.shape[-1]
+    top = np.max(log_weights, axis=-1, keepdims=True)
+    relative = np.exp(log_weights - np.where(top == -np.inf, 0.0, top))
+    mean = np.mean(relative, axis=-1)
+    variance = np.var(relative[..., own:], axis=-1, ddof=1) / np.where(mean == 0, 1.0, mean) ** 2
+    with np.errstate(divide="ignore"):
+        others = np.log((size * mean[..., None] - relative).clip(0.0) / (size - 1))
+        ratios = log_weights - np.where(top == -np.inf, 0.0, top) - others
+    ratios = np.where(relative == 0, -np.inf, ratios)[..., own:]
+    ratios = np.moveaxis(ratios, 0, -2).reshape(*log_weights.shape[1:-1], -1)
+    # weights that are equal but for rounding have no tail to be judged by
+    equal = np.nanmax(np.abs(ratios), axis=-1, keepdims=True, initial=0.0) < _EQUAL
+    ratios = np.where(equal & ~np.isnan(ratios), 0.0, ratios)
+    return np.sqrt(np.mean(variance, axis=0) / size), np.asarray(weights.pareto_k(ratios))
 
 
 def _warn_of_tails(shapes, size):
-    threshold = weights.pareto_k_threshold(size)
-    bad = {name: np.argwhere(~(k < threshold)) for name, k in shapes.items()}
-    for name, places in bad.items():
+    for name, k in shapes.items():
+        places = np.argwhere(np.isnan(k) | surely_heavy(k, size))
         if len(places):
             which = ", ".join(str(tuple(map(int, place))) for place in places[:5])
             warnings.warn(
-                f"`{name}`: the weights by which {len(places)} of {shapes[name].size} data are integrated have too "
-                f"heavy a tail, k̂ up to {np.max(shapes[name]):.2f} (data {which}). Choose a better guide.",
+                f"`{name}`: the weights by which {len(places)} of {k.size} data are integrated have too heavy a tail, "
+                f"k̂ up to {np.max(k):.2f} (data {which}). Choose a better guide.",
                 stacklevel=3,
             )
