@@ -10,7 +10,7 @@ import pytest
 import scipy.stats as stats
 from numpyro import handlers
 from numpyro.contrib.control_flow import scan
-from numpyro.infer import MCMC, NUTS
+from numpyro.infer import MCMC, NUTS, Predictive
 from numpyro.infer.util import log_density
 
 import numpyro_bridges as nb
@@ -85,14 +85,14 @@ def test_one_point_is_that_of_the_chain():
 # Effects
 
 
-def model_of_units(data):
-    """Effects of each unit on both of its coordinates, and one that is positive and depends on the first."""
+def model_of_units(data=None, units=6):
+    """An effect of each unit on both of its coordinates."""
     mean = numpyro.sample("mean", dist.Normal(0.0, 1.0))
     spread = numpyro.sample("spread", dist.LogNormal(-1.0, 0.5))
-    with numpyro.plate("unit", len(data)):
+    with numpyro.plate("unit", units):
         shift = numpyro.sample("shift", dist.Normal(mean, spread))
         numpyro.deterministic("twice", 2 * shift)
-        nb.sample("wing", law_of(shift, dim=2, batch_shape=(len(data),)), obs=data)
+        nb.sample("wing", law_of(shift, dim=2, batch_shape=(units,)), obs=data)
 
 
 UNITS = np.random.default_rng(0).normal(0.4, 0.8, (6, 2))
@@ -150,6 +150,27 @@ def test_leave_one_out_of_units(units):
     assert values.shape == (2, 100, 6)
     print(f"{harmonic(values):.3f}, exactly {elpd.sum():.3f}")
     assert harmonic(values) == pytest.approx(elpd.sum(), abs=0.25)
+
+
+def test_predictive_checks(units):
+    """The same units keep their effects, and new ones have others; noise plays no part in either."""
+    draws = {name: value[::2] for name, value in units[0].get_samples().items()}
+    same = Predictive(model_of_units, draws)(jr.key(0))["wing"]
+    assert same.shape == (400, 6, 2)
+    check_normal((same - SLOPE * draws["shift"][..., None]) / np.sqrt(VARIANCE))
+    shared = {name: draws[name] for name in ("mean", "spread")}
+    new = Predictive(model_of_units, shared)(jr.key(1), units=5)["wing"].sum(-1)  # both coordinates have the effect
+    assert new.shape == (400, 5)
+    variance = 2 * VARIANCE + (2 * SLOPE * draws["spread"]) ** 2
+    check_normal((new - 2 * SLOPE * draws["mean"][:, None]) / np.sqrt(variance)[:, None])
+    with pytest.raises(ValueError, match="one noise for each datum"):
+        Predictive(model_of_units, {"wing_noise": draws["wing_noise"]})(jr.key(1), units=5)
+
+
+def check_normal(values):
+    """The distribution of independent standard normal numbers, by Kolmogorov and Smirnov: seen within 5 %."""
+    found = stats.kstest(np.ravel(values), "norm")
+    assert found.pvalue > 1e-4 and np.size(values) >= 2000
 
 
 def positive(data):
