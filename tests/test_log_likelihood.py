@@ -1,4 +1,4 @@
-"""Log likelihoods whose noise and effects of a unit are integrated out, and models without their noise."""
+"""Log likelihoods with noise and effects of a unit integrated out, and models without noise."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,9 @@ SLOPE, VARIANCE = 1 - np.exp(-RATE), SIGMA**2 * (1 - np.exp(-2 * RATE)) / (2 * R
 def made_up_run(model, samples, *args):
     """A run with these draws, chains in front."""
     chains, draws = next(iter(samples.values())).shape[:2]
-    mcmc = MCMC(NUTS(model), num_warmup=0, num_samples=draws, num_chains=chains, chain_method="sequential")
+    mcmc = MCMC(
+        NUTS(model), num_warmup=0, num_samples=draws, num_chains=chains, chain_method="sequential"
+    )
     mcmc._states, mcmc._args, mcmc._kwargs = {"z": samples}, args, {}
     return mcmc
 
@@ -66,9 +68,9 @@ def unguided(data):
 
 
 def test_one_point_is_that_of_the_chain():
-    """Data and noise by `sample_with_noise`, so that each noise is a draw given its datum: 1 / p̂ has mean 1 / p.
+    """Each noise is a draw given its datum, by `sample_with_noise`: 1 / p̂ has mean 1 / p.
 
-    With new points alone p̂ has mean p; 1 / p̂ is then too large by the relative variance of p̂, which is large here.
+    With new points alone p̂ has mean p, and 1 / p̂ is too large by the relative variance of p̂.
     """
     mean, size = 0.7, 4000
     data, noise = unguided_law(mean).expand([size]).sample_with_noise(jr.key(0))
@@ -99,8 +101,11 @@ UNITS = np.random.default_rng(0).normal(0.4, 0.8, (6, 2))
 
 
 def log_density_of_units(mean, spread):
-    """Both coordinates of a unit share its effect: a dense normal, by their sum and their difference."""
-    mean, variance = SLOPE * np.asarray(mean)[..., None], VARIANCE + 2 * (SLOPE * np.asarray(spread)[..., None]) ** 2
+    """Both coordinates of a unit share its effect: a dense normal, by sum and difference."""
+    mean, variance = (
+        SLOPE * np.asarray(mean)[..., None],
+        VARIANCE + 2 * (SLOPE * np.asarray(spread)[..., None]) ** 2,
+    )
     sums = (UNITS.sum(1) - 2 * mean) ** 2 / (2 * variance) + np.log(2 * np.pi * variance)
     differences = (UNITS[:, 0] - UNITS[:, 1]) ** 2 / (2 * VARIANCE) + np.log(2 * np.pi * VARIANCE)
     return -0.5 * (sums + differences)
@@ -108,7 +113,7 @@ def log_density_of_units(mean, spread):
 
 @pytest.fixture(scope="module")
 def units():
-    """Exact draws of parameters, from a grid, and of effects; the noise of an exact guide is standard normal."""
+    """Exact draws of parameters, from a grid, and of effects; an exact guide leaves N(0, I)."""
     means, spreads = np.linspace(-2.5, 3.5, 121), np.exp(np.linspace(-3.5, 1.5, 101))
     pointwise = log_density_of_units(*np.meshgrid(means, spreads, indexing="ij"))
     prior = stats.norm.logpdf(means)[:, None] + stats.norm(-1, 0.5).logpdf(np.log(spreads))
@@ -134,7 +139,10 @@ def test_effects_are_integrated_out(units):
     values = found.values["wing"].reshape(-1, len(UNITS))
     check_mean_is_1(np.exp(truth - values), 0.03)
     error = np.sqrt(np.mean((values - truth) ** 2))
-    assert error == pytest.approx(np.sqrt(np.mean(found.standard_error["wing"] ** 2)), rel=0.3) and error < 0.3
+    assert (
+        error == pytest.approx(np.sqrt(np.mean(found.standard_error["wing"] ** 2)), rel=0.3)
+        and error < 0.3
+    )
     assert np.all(found.pareto_k["wing"] < 0.7) and "6 data" in str(found)
 
 
@@ -153,13 +161,15 @@ def test_leave_one_out_of_units(units):
 
 
 def test_predictive_checks(units):
-    """The same units keep their effects, and new ones have others; noise plays no part in either."""
+    """The same units keep their effects, new ones have others; noise plays no part."""
     draws = {name: value[::2] for name, value in units[0].get_samples().items()}
     same = Predictive(model_of_units, draws)(jr.key(0))["wing"]
     assert same.shape == (400, 6, 2)
     check_normal((same - SLOPE * draws["shift"][..., None]) / np.sqrt(VARIANCE))
     shared = {name: draws[name] for name in ("mean", "spread")}
-    new = Predictive(model_of_units, shared)(jr.key(1), units=5)["wing"].sum(-1)  # both coordinates have the effect
+    new = Predictive(model_of_units, shared)(jr.key(1), units=5)["wing"].sum(
+        -1
+    )  # both coordinates have the effect
     assert new.shape == (400, 5)
     variance = 2 * VARIANCE + (2 * SLOPE * draws["spread"]) ** 2
     check_normal((new - 2 * SLOPE * draws["mean"][:, None]) / np.sqrt(variance)[:, None])
@@ -168,7 +178,7 @@ def test_predictive_checks(units):
 
 
 def check_normal(values):
-    """The distribution of independent standard normal numbers, by Kolmogorov and Smirnov: seen within 5 %."""
+    """Independent standard normal numbers, by the test of Kolmogorov and Smirnov."""
     found = stats.kstest(np.ravel(values), "norm")
     assert found.pvalue > 1e-4 and np.size(values) >= 2000
 
@@ -182,16 +192,20 @@ def positive(data):
 
 
 def test_any_proposal_gives_the_integral():
-    """New points alone, of effects whose draws are not those of the posterior; against quadrature."""
+    """New points alone, of effects whose draws are not of the posterior; against quadrature."""
     data, rng = np.array([[0.2], [2.0], [1.0]]), np.random.default_rng(2)
     samples = {"mean": rng.normal(0.3, 0.4, (1, 150)), "also": rng.normal(0.5, 0.4, (1, 150, 3))}
     samples["size"] = np.exp(rng.normal(0.4, 0.2, (1, 150, 3)))
-    found = nb.log_likelihood(made_up_run(positive, samples, data), num_particles=64).values["wing"][0]
+    found = nb.log_likelihood(made_up_run(positive, samples, data), num_particles=64).values[
+        "wing"
+    ][0]
     log_size, step = np.linspace(-5, 5, 2001, retstep=True)
     truth = []
     for mean in samples["mean"][0]:
         prior = stats.norm(mean, 0.5).pdf(log_size)
-        seen = stats.norm(SLOPE * 1.3 * np.exp(log_size), np.sqrt(VARIANCE + (SLOPE * 0.2) ** 2)).pdf(data)
+        seen = stats.norm(
+            SLOPE * 1.3 * np.exp(log_size), np.sqrt(VARIANCE + (SLOPE * 0.2) ** 2)
+        ).pdf(data)
         truth.append(np.sum(prior * seen, 1) * step)
     check_mean_is_1(np.exp(found) / np.array(truth), 0.05)
 
@@ -203,13 +217,16 @@ def parts_of(model):
     """By observed sites: the noise, the effects and what must be known."""
     mcmc = made_up_run(model, {"mean": np.zeros((1, 1))})
     _, replay = model_of(mcmc)
-    return {part.name: (part.noise, part.effects, part.needs) for part in _parts(sites_of(model, (), {}), replay)}
+    return {
+        part.name: (part.noise, part.effects, part.needs)
+        for part in _parts(sites_of(model, (), {}), replay)
+    }
 
 
 def test_effects_are_those_of_the_plates_of_a_datum():
     def nested():
         mean = numpyro.sample("mean", dist.Normal())
-        with numpyro.plate("groups", 2):
+        with numpyro.plate("groups", 3):  # as many as specimens
             group = numpyro.sample("group", dist.Normal(mean))
         with numpyro.plate("specimens", 3, dim=-1):
             effect = numpyro.sample("effect", dist.Normal(group[np.array([0, 0, 1])]))
@@ -242,9 +259,16 @@ def test_sites_that_share_an_effect_are_left_out_together():
         "wing+size": (("wing_noise",), ("base", "effect"), frozenset()),
         "other": ((), (), frozenset()),
     }
-    samples = {"base": np.zeros((1, 9, 3)), "effect": np.zeros((1, 9, 3)), "wing_noise": np.zeros((1, 9, 3, 2, 1, 1))}
+    samples = {
+        "base": np.zeros((1, 9, 3)),
+        "effect": np.zeros((1, 9, 3)),
+        "wing_noise": np.zeros((1, 9, 3, 2, 1, 1)),
+    }
     found = nb.to_arviz(made_up_run(joint, samples)).log_likelihood
-    assert found["wing+size"].dims == ("chain", "draw", "specimens") and set(found.data_vars) == {"wing+size", "other"}
+    assert found["wing+size"].dims == ("chain", "draw", "specimens") and set(found.data_vars) == {
+        "wing+size",
+        "other",
+    }
     np.testing.assert_allclose(found["other"], stats.norm.logpdf(0.0))
 
 
@@ -273,17 +297,29 @@ def waves(t, x, args):
 def test_noise_of_tips_is_drawn_anew():
     """A root with two tips is two bridges."""
     tree = nb.Tree.from_newick("((a:0.5,b:0.5)c:0.3,d:1.0);")
-    root = nb.DiffusionTree(nb.BrownianMotion(0.5), np.zeros(1), nb.InexactMatch(0.1), tree=tree, num_steps=2)
+    root = nb.DiffusionTree(
+        nb.BrownianMotion(0.5), np.zeros(1), nb.InexactMatch(0.1), tree=tree, num_steps=2
+    )
     blocks = root.noise_blocks
-    tips = [node for node in tree.active if node not in {tree.parents[other] for other in tree.active}]
+    tips = [
+        node for node in tree.active if node not in {tree.parents[other] for other in tree.active}
+    ]
     assert [tree.names[node] for node in tips] == ["a", "b", "d"]
-    np.testing.assert_array_equal(_rows_of_tips(blocks), [False, False, True, True, True, True, True, True])
-    sde, seen, data = nb.SDE(waves, lambda t, x, args: 0.7), nb.InexactMatch(0.05), np.array([[0.9], [0.3]])
+    np.testing.assert_array_equal(
+        _rows_of_tips(blocks), [False, False, True, True, True, True, True, True]
+    )
+    sde, seen, data = (
+        nb.SDE(waves, lambda t, x, args: 0.7),
+        nb.InexactMatch(0.05),
+        np.array([[0.9], [0.3]]),
+    )
     star = nb.Tree.from_newick("(a:0.5,b:0.8);")
 
     def model():
         numpyro.sample("mean", dist.Normal())
-        nb.sample("tips", nb.DiffusionTree(sde, np.array([0.2]), seen, tree=star, num_steps=4), obs=data)
+        nb.sample(
+            "tips", nb.DiffusionTree(sde, np.array([0.2]), seen, tree=star, num_steps=4), obs=data
+        )
 
     samples = {"mean": np.zeros((1, 2)), "tips_noise": np.zeros((1, 2, 8, 1, 1))}
     found = nb.log_likelihood(made_up_run(model, samples), num_particles=4000)
@@ -291,7 +327,10 @@ def test_noise_of_tips_is_drawn_anew():
         bridge = nb.GuidedBridge(sde, seen.at(data[i]), x0=np.array([0.2]), t1=t1, num_steps=4)
         truth = nb.estimate_evidence(bridge, jr.key(1), num_particles=4000)
         errors = np.hypot(found.standard_error["tips"][i], truth.standard_error)
-        assert 0.001 < errors < 0.05 and abs(found.values["tips"][0, 1, i] - truth.log_evidence) < 4 * errors
+        assert (
+            0.001 < errors < 0.05
+            and abs(found.values["tips"][0, 1, i] - truth.log_evidence) < 4 * errors
+        )
 
 
 # Models without their noise
@@ -302,7 +341,9 @@ def test_a_model_without_its_noise_has_the_likelihood_on_average():
 
     @jax.jit
     def log_densities(keys):
-        one = lambda key: log_density(handlers.seed(parameters, key), (data,), {}, {"mean": mean})[0]  # noqa: E731
+        def one(key):
+            return log_density(handlers.seed(parameters, key), (data,), {}, {"mean": mean})[0]
+
         return jax.lax.map(one, keys, batch_size=500)
 
     truth = stats.norm.logpdf(mean) + stats.norm(SLOPE * mean, UNGUIDED_SD).logpdf(data).sum()
@@ -315,10 +356,14 @@ def test_noise_that_is_not_of_one_law():
     def classes():
         laws = [law_of(mean) for mean in (0.0, 1.0)]
         noise = numpyro.sample("noise", laws[0].noise_prior(), infer={"driving_noise": True})
-        mixed = dist.MixtureGeneral(dist.CategoricalProbs(jnp.ones(2) / 2), [law.given(noise) for law in laws])
+        mixed = dist.MixtureGeneral(
+            dist.CategoricalProbs(jnp.ones(2) / 2), [law.given(noise) for law in laws]
+        )
         numpyro.sample("wing", mixed, obs=np.zeros(1))
 
-    with pytest.raises(ValueError, match=r"each noise must drive one observed law.*\['noise'\].*\[\]"):
+    with pytest.raises(
+        ValueError, match=r"each noise must drive one observed law.*\['noise'\].*\[\]"
+    ):
         handlers.seed(nb.infer.integrate_noise(classes), 0)()
     assert parts_of(classes) == {"wing": (("noise",), (), frozenset())}
 

@@ -14,15 +14,20 @@ from ..distributions import AbstractNoiseDriven
 def model_of(mcmc):
     """The model of a run, and a function that replays it.
 
-    `replay(value_of, names)`: the laws and values of these sites where every site has the value that `value_of(site)`
-    gives it.
+    `replay(value_of, names)`: the laws and values of these sites where every site has the value
+    that `value_of(site)` gives it.
     """
     require_instance(mcmc, MCMC, "mcmc", "an `MCMC` of NumPyro")
     model = getattr(mcmc.sampler, "model", None)
-    require(callable(model), "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.")
+    require(
+        callable(model),
+        "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.",
+    )
 
     def replay(value_of, names):
-        at_values = numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), substitute_fn=value_of)
+        at_values = numpyro.handlers.substitute(
+            numpyro.handlers.seed(model, 0), substitute_fn=value_of
+        )
         trace = numpyro.handlers.trace(at_values).get_trace(*mcmc._args, **mcmc._kwargs)
         return {name: (trace[name]["fn"], trace[name]["value"]) for name in names}
 
@@ -33,7 +38,10 @@ def with_noise(mcmc):
     """Indices of the draws whose noise is there, and the values of those draws."""
     samples = mcmc.get_samples(group_by_chain=True)
     draws = np.arange(next(iter(samples.values())).shape[1])
-    noise, every = mcmc.get_extra_fields(group_by_chain=True).get("noise"), getattr(mcmc, "_keep_noise", None)
+    noise, every = (
+        mcmc.get_extra_fields(group_by_chain=True).get("noise"),
+        getattr(mcmc, "_keep_noise", None),
+    )
     if not isinstance(noise, dict) or not every or every > len(draws):
         return draws, samples
     draws = draws[every - 1 :: every]
@@ -71,7 +79,8 @@ def mask_of(law):
 
 
 def surely_heavy(k, num_particles):
-    """Whether k̂ is above the threshold by two standard errors: of many data one is above it by chance."""
+    """Whether k̂ is above the threshold by two standard errors: of many data one is above it by
+    chance."""
     k = np.clip(k, 0.0, 2.0)
     error = (1 + k) / np.sqrt(3 * np.sqrt(num_particles))
     return k - 2 * error >= weights.pareto_k_threshold(num_particles)

@@ -1,12 +1,13 @@
-"""A model whose likelihoods are averages over fresh driving noise, for variational inference of its parameters.
+"""Models whose likelihoods are averages over new driving noise, for variational inference.
 
 The objective of `SVI` with a guide q of the parameters is then
 
     E_q E_z [log p(θ) + Σ_s log 1/K Σ_k p(v_s | θ, z_sk) - log q(θ)],    z_sk ~ N(0, I),
 
-an importance weighted bound [@burda2016] in the noise, and the usual one in the parameters. It is below that of the
-model whose noise is integrated out by about 1/(2K) of the relative variance of the weights of each datum. A guide of
-noise and parameters, mean-field or not, leaves out most of what the two say of each other.
+an importance weighted bound [@burda2016] in the noise, and the usual one in the parameters. It is
+below that of the model whose noise is integrated out by about 1/(2K) of the relative variance of
+the weights of each datum. A guide of noise and parameters, mean-field or not, leaves out most of
+what the two say of each other.
 """
 
 import jax
@@ -22,7 +23,7 @@ from ._posterior import is_noise
 
 
 def integrate_noise(model, num_particles: int = 16):
-    """A model without driving noise: the likelihood of each datum is the mean of the weights of K new bridges.
+    """A model without driving noise: each datum has the mean of the weights of K new bridges.
 
         parameters = nb.infer.integrate_noise(model)
         guide = AutoMultivariateNormal(parameters)
@@ -30,16 +31,21 @@ def integrate_noise(model, num_particles: int = 16):
 
     **Arguments:**
 
-    - `model`: a NumPyro model that observes laws by `sample`. Its other latent sites stay as they are.
-    - `num_particles`: K. The bound of each datum is too low by about the relative variance of its weights over 2K, and
-      the posterior is off by how much that varies with the parameters: compare two numbers.
+    - `model`: a NumPyro model that observes laws by `sample`. Its other latent sites stay as they
+      are.
+    - `num_particles`: K. The bound of each datum is too low by about the relative variance of its
+      weights over 2K, and the posterior is off by how much that varies with the parameters: compare
+      two numbers.
 
-    **Returns:** a model of the same arguments, random at every call: it is for `SVI`, which gives it a key at each
-    step, and for no kernel of MCMC. Plates that are subsampled may be used.
+    **Returns:** a model of the same arguments, random at every call: it is for `SVI`, which gives
+    it a key at each step, and for no kernel of MCMC. Plates that are subsampled may be used.
 
-    **Errors:** `ValueError` for noise that drives anything but one observed law, or sites in a `scan`.
+    **Errors:** `ValueError` for noise that drives anything but one observed law, and for sites in a
+    `scan`.
     """
-    require(callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}.")
+    require(
+        callable(model), f"`model` must be a NumPyro model, a callable; got {type(model).__name__}."
+    )
     num_particles = positive_integer(num_particles, "num_particles")
 
     def integrated(*args, **kwargs):
@@ -67,7 +73,8 @@ class _Averages(Messenger):
             return
         require(
             not msg.get("_control_flow_done"),
-            f"site `{msg['name']}` is in a `scan`, where a noise may reach later data: write the loop out.",
+            f"site `{msg['name']}` is in a `scan`, where a noise may reach later data: write the "
+            "loop out.",
         )
         if driven:
             self._averaged.append(msg["name"])
@@ -80,8 +87,8 @@ class _Averages(Messenger):
     def check(self):
         require(
             len(self._hidden) == len(self._averaged),
-            f"each noise must drive one observed law, by `numpyro_bridges.sample`; the model has the noise "
-            f"{self._hidden} and observes the laws {self._averaged}.",
+            "each noise must drive one observed law, by `numpyro_bridges.sample`; the model has "
+            f"the noise {self._hidden} and observes the laws {self._averaged}.",
         )
 
 
@@ -103,4 +110,5 @@ class _Averaged(dist.Distribution):
 
     def log_prob(self, value, intermediates=None):
         noise = self._law.noise_prior().sample(self._key, (self._num_particles,))
-        return weights.log_mean_exp(jax.vmap(lambda z: self._law.given(z).log_prob(value))(noise), axis=0)
+        log_weights = jax.vmap(lambda z: self._law.given(z).log_prob(value))(noise)
+        return weights.log_mean_exp(log_weights, axis=0)

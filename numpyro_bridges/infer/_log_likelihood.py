@@ -4,17 +4,21 @@ With θ what all data share, z_i the driving noise of datum i and u_i the latent
 
     p(v_i | θ) = ∫ p(u_i | θ) N(z_i; 0, I) p(v_i | θ, u_i, z_i) du_i dz_i
 
-is the mean over k of the weights w_k = p(v_i | θ, u_k, z_k) p(u_k | θ) / q(u_k | θ), with z_k from its prior and u_k
-from q, a mixture of the prior of u_i and of a Student distribution fitted to its posterior draws.
+is the mean over k of the weights w_k = p(v_i | θ, u_k, z_k) p(u_k | θ) / q(u_k | θ), with z_k from
+its prior and u_k from q, a mixture of the prior of u_i and of a Student distribution fitted to its
+posterior draws.
 
-**One of the K points is that of the chain.** Given θ it has the density q(u) N(z) w(u, z) / p(v_i | θ), so that all K
-together have that of the pseudo-marginal method [@andrieu2009], q N p̂ / p(v_i | θ) for each point, in which
+**One of the K points is that of the chain.** Given θ it has the density
+q(u) N(z) w(u, z) / p(v_i | θ), so that all K together have that of the pseudo-marginal method
+[@andrieu2009], the product of all q(u_k) N(z_k) times p̂ / p(v_i | θ), p̂ being the mean of the
+weights, in which
 
     E[1 / p̂ | θ] = ∫ q N (p̂ / p(v_i | θ)) (1 / p̂) = 1 / p(v_i | θ)
 
-for every K. Leave-one-out asks for the posterior mean of this inverse: K does not bias it, and the spread of the
-ratios, which is that of single weights at K = 1, falls with K. With fresh points alone E[1 / p̂] is too large, by the
-relative variance of p̂. Where the run has not kept the noise, fresh points are all that there is.
+for every K. Leave-one-out asks for the posterior mean of this inverse: K does not bias it, and the
+spread of the ratios, which is that of single weights at K = 1, falls with K. With fresh points
+alone E[1 / p̂] is too large, by the relative variance of p̂. Where the run has not kept the noise,
+fresh points are all that there is.
 """
 
 import math
@@ -56,10 +60,10 @@ class LogLikelihood(NamedTuple):
     """The log likelihood of each datum, integrated. `str` of it has a line for each site.
 
     - `values`: by site, `(chains, draws, *data)`.
-    - `standard_error`: by site, `(*data)`: of the value at one draw, in nats, from the fresh weights. Averages over
-      draws have far less. 0 where nothing was integrated.
-    - `pareto_k`: by site, `(*data)`: k̂ of the fresh weights of all draws, each relative to the mean of the others.
-      -inf where nothing was integrated.
+    - `standard_error`: by site, `(*data)`: of the value at one draw, in nats, from the fresh
+      weights. Averages over draws have far less. 0 where nothing was integrated.
+    - `pareto_k`: by site, `(*data)`: k̂ of the fresh weights of all draws, each relative to the
+      mean of the others. -inf where nothing was integrated.
     - `sites`: by name, the observed sites that are left out together, mostly one.
     - `draws`: which of each chain. `num_particles`: K.
     """
@@ -77,17 +81,19 @@ class LogLikelihood(NamedTuple):
             f"k̂ at most {np.max(self.pareto_k[name]):.2f}"
             for name, error in self.standard_error.items()
         ]
-        return "\n".join([f"{len(self.draws)} draws of each chain, {self.num_particles} particles", *lines])
+        return "\n".join(
+            [f"{len(self.draws)} draws of each chain, {self.num_particles} particles", *lines]
+        )
 
 
 def log_likelihood(
     mcmc: MCMC, key: Array | None = None, *, num_particles: int = 16, draws: int | None = None
 ) -> LogLikelihood:
-    """The log likelihood log p(v_i | θ) of each datum, at draws of the parameters that all data share.
+    """The log likelihood log p(v_i | θ) of each datum, at draws of the parameters that all share.
 
-    The driving noise of a datum is integrated out by guided paths, and with it the latent sites in the same plates as
-    the datum, such as an effect of each specimen. An ordinary site of NumPyro without such latent sites has its
-    ordinary log likelihood.
+    The driving noise of a datum is integrated out by guided paths, and with it the latent sites in
+    the same plates as the datum, such as an effect of each specimen. An ordinary site of NumPyro
+    without such latent sites has its ordinary log likelihood.
 
         arviz.loo(nb.to_arviz(mcmc, log_likelihood=nb.log_likelihood(mcmc, num_particles=64)))
 
@@ -95,22 +101,26 @@ def log_likelihood(
 
     - `mcmc`: after `run`, with any kernel of a model.
     - `key`: of the paths; by default the same always.
-    - `num_particles`: K, the points of noise and effects by which each datum is integrated at each draw, at least 8.
-    - `draws`: how many draws of all chains together, evenly spaced. By default 200, or all where nothing is integrated.
-      The cost is that of the log likelihood of all data, `draws * num_particles` times.
+    - `num_particles`: K, the points of noise and effects by which each datum is integrated at each
+      draw, at least 8.
+    - `draws`: how many draws of all chains together, evenly spaced. By default 200, or all where
+      nothing is integrated. The cost is that of the log likelihood of all data, `draws *
+      num_particles` times.
 
-    **Returns:** a `LogLikelihood`. Sites that share an effect are left out together, under the names of both,
-    `wing+leg`. Latent sites are as in the draws where they are in other plates than the datum, such as those of its
-    group, or reach data in other plates. A `DiffusionTree` has one value for each seen node, given all other nodes: the
-    noise of a tip's branch is integrated out, that of other branches is as in the draws, which is what leaving out one
-    node asks for (`DiffusionTree.log_prob_by_node`). `handlers.scale` does not enter, and masked data have 0. Left out
-    are sites that need what the run has not kept, other than the noise and the effects of data, and, with a warning,
-    data in a `scan` that noise drives.
+    **Returns:** a `LogLikelihood`. Sites that share an effect are left out together, under the
+    names of both, `wing+leg`. Latent sites are as in the draws where they are in other plates than
+    the datum, such as those of its group, or reach data in other plates. A `DiffusionTree` has one
+    value for each seen node, given all other nodes: the noise of a tip's branch is integrated out,
+    that of other branches is as in the draws, which is what leaving out one node asks for
+    (`DiffusionTree.log_prob_by_node`). `handlers.scale` does not enter, and masked data have 0.
+    Left out are sites that need what the run has not kept, other than the noise and the effects of
+    data, and, with a warning, data in a `scan` that noise drives.
 
-    **Errors:** `ValueError` for a kernel without a model. `UserWarning` where a k̂ is above `pareto_k_threshold` by two
-    standard errors: of many data some k̂ are large by chance.
+    **Errors:** `ValueError` for a kernel without a model. `UserWarning` where a k̂ is above
+    `pareto_k_threshold` by two standard errors: of many data some k̂ are large by chance.
 
-    **Source:** [@vehtari2016] for integrated leave-one-out; [@merkle2019] for what the conditional one answers.
+    **Source:** [@vehtari2016] for integrated leave-one-out; [@merkle2019] for what the conditional
+    one answers.
     """
     model, replay = model_of(mcmc)
     key = jr.key(0) if key is None else key
@@ -127,30 +137,39 @@ def log_likelihood(
     if len(numbers) < min(wanted, length):
         numbers, driving = np.arange(length), samples
     places = spaced(len(numbers), wanted)
-    at = {name: _flat(value[:, places]) for name, value in driving.items() if is_latent(sites.get(name, _NONE))}
+    at = {
+        name: _flat(value[:, places])
+        for name, value in driving.items()
+        if is_latent(sites.get(name, _NONE))
+    }
     parts = [part for part in parts if part.needs <= set(at)]
     own = all(name in at for part in parts for name in part.fresh)
-    proposals = {part.name: _fitted(part, samples, sites, replay) for part in parts if set(part.effects) & set(samples)}
+    proposals = {
+        part.name: _fitted(part, samples, sites, replay)
+        for part in parts
+        if part.effects and set(part.effects) <= set(samples)
+    }
     chosen = (np.arange(chains)[:, None] * length + numbers[places]).ravel()
-    centres = {name: mean[chosen] for name, (mean, _) in proposals.items()}
-    factors = {name: factor for name, (_, factor) in proposals.items()}
+    means = {name: mean[chosen] for name, (mean, _) in proposals.items()}
 
-    def at_draw(values, centres, key):
-        laws = {name: dist.MultivariateStudentT(_TAILS, mean, factors[name]) for name, mean in centres.items()}
+    def at_draw(values, means, key):
+        laws = {
+            name: dist.MultivariateStudentT(_TAILS, mean, proposals[name][1])
+            for name, mean in means.items()
+        }
 
         def at_point(key, is_own):
             return _log_weights(parts, laws, replay, values, key, is_own)
 
         return jax.vmap(at_point)(jr.split(key, num_particles), np.arange(num_particles) < own)
 
-    found = {}
-    if parts:
-        keys = jr.split(key, len(chosen))
-        found = gather(jax.jit(spread(at_draw, batch_size=1))(at, centres, keys))
+    # every device takes its draws one after the other: the points of one are a batch already
+    run = jax.jit(spread(at_draw, batch_size=1))
+    found = gather(run(at, means, jr.split(key, len(chosen)))) if parts else {}
     values, errors, shapes = {}, {}, {}
     for name, log_weights in found.items():
         log_weights = np.moveaxis(np.asarray(log_weights), 1, -1)  # (draws, *data, K)
-        mean = np.asarray(weights.log_mean_exp(log_weights))
+        mean = np.asarray(weights.log_mean_exp(jnp.asarray(log_weights)))
         values[name] = mean.reshape(chains, len(places), *mean.shape[1:])
         errors[name], shapes[name] = _quality(log_weights, int(own))
     _warn_of_tails(shapes, num_particles * len(chosen))
@@ -161,8 +180,8 @@ def log_likelihood(
 class _Part(NamedTuple):
     """Data that are left out together, and what is integrated out with them.
 
-    `noise`, `effects`: sites that are drawn anew. `tips`: noise of trees, of which that of the tips is. `needs`: latent
-    sites whose values must be known.
+    `noise`, `effects`: sites that are drawn anew. `tips`: noise of trees, of which that of the tips
+    is. `needs`: latent sites whose values must be known.
     """
 
     sites: tuple[str, ...]
@@ -200,10 +219,13 @@ def _parts(sites, replay) -> list[_Part]:
     sources = {name: set(found) - {name} for name, found in sources.items()}
     users = {name: {user for user, found in sources.items() if name in found} for name in latent}
     noise = {name for name in latent if is_noise(sites[name])}
-    in_loops = {name for name in data if sites[name].get("_control_flow_done") and sources[name] & noise}
+    in_loops = {
+        name for name in data if sites[name].get("_control_flow_done") and sources[name] & noise
+    }
     if in_loops:
         warnings.warn(
-            f"{sorted(in_loops)} are data in a `scan`, where a noise may reach later data: they get no log likelihood.",
+            f"{sorted(in_loops)} are data in a `scan`, where a noise may reach later data: they "
+            "get no log likelihood.",
             stacklevel=3,
         )
     local = _local(sites, data, users)
@@ -218,7 +240,11 @@ def _parts(sites, replay) -> list[_Part]:
             together, inside = joined, found
         remaining = [name for name in remaining if name not in together]
         needs = {source for name in together | inside for source in sources[name]} - inside
-        blocks = {name for name in needs & noise if users[name] == together and sites[name]["infer"].get("blocks")}
+        blocks = {
+            name
+            for name in needs & noise
+            if users[name] == together and sites[name]["infer"].get("blocks")
+        }
         parts.append(
             _Part(
                 tuple(name for name in data if name in together),
@@ -249,21 +275,27 @@ def _local(sites, data, users) -> set[str]:
 
     local = {name for name in users if may_be(name)}
     while True:
-        kept = {name for name in local if users[name] and all(of_one_datum(name, user) for user in users[name])}
+        kept = {
+            name
+            for name in local
+            if users[name] and all(of_one_datum(name, user) for user in users[name])
+        }
         if kept == local:
             return local
         local = kept
 
 
 def _fitted(part: _Part, samples, sites, replay):
-    """What the draws say of the effects of each unit: means given what is shared, `(draws, *data, d)`, and a factor.
+    """What the draws say of the effects of each unit: means `(draws, *data, d)`, and a factor.
 
-    All unconstrained. The means are a linear regression on the shared parameters, where there are 10 draws or more for
-    each; the factor is that of what is left.
+    All unconstrained. The means are a linear regression on the shared parameters, where there are
+    10 draws or more for each; the factor is that of the covariance of what is left.
     """
     shared = [name for name in sorted(part.needs) if not sites[name]["fn"].support.is_discrete]
     shared = [name for name in shared if not is_noise(sites[name]) and name in samples]
-    draws = {name: _flat(value) for name, value in samples.items() if is_latent(sites.get(name, _NONE))}
+    draws = {
+        name: _flat(value) for name, value in samples.items() if is_latent(sites.get(name, _NONE))
+    }
     draws = {name: value for name, value in draws.items() if not is_noise(sites[name])}
 
     def unconstrained(draw):
@@ -275,7 +307,9 @@ def _fitted(part: _Part, samples, sites, replay):
     size = len(effects)
     mean = jnp.mean(effects, axis=0)
     rest = effects - mean
-    g = jnp.concatenate([jnp.zeros((size, 0)), *(found[name].reshape(size, -1) for name in shared)], axis=1)
+    g = jnp.concatenate(
+        [jnp.zeros((size, 0)), *(found[name].reshape(size, -1) for name in shared)], axis=1
+    )
     if 0 < 10 * g.shape[1] <= size:
         g = g - jnp.mean(g, axis=0)
         explained = g @ jnp.linalg.lstsq(g, rest.reshape(size, -1))[0]
@@ -285,7 +319,8 @@ def _fitted(part: _Part, samples, sites, replay):
     @partial(jnp.vectorize, signature="(d),(d,d)->(d,d)")
     def factor(mean, squares):
         """1 where draws do not vary: any will do, since points have weights."""
-        return if_finite(from_moments(mean, squares, size), Reference(mean, jnp.eye(mean.size))).scale
+        unit = Reference(mean, jnp.eye(mean.size))
+        return if_finite(from_moments(mean, squares, size), unit).scale
 
     return effects - rest, factor(mean, squares)
 
@@ -353,9 +388,11 @@ def _correction(proposal, effects):
     for law, value in effects:
         transform = biject_to(law.support)
         log_det = transform.log_abs_det_jacobian(transform.inv(value), value)
-        prior += law.log_prob(value) + sum_rightmost(log_det, jnp.ndim(log_det) - len(law.batch_shape))
+        inner = jnp.ndim(log_det) - len(law.batch_shape)
+        prior += law.log_prob(value) + sum_rightmost(log_det, inner)
         mask = mask_of(law)
-        seen &= jnp.ones((), bool) if mask is None else mask  # what is masked has no density, and no weight
+        if mask is not None:  # what is masked has no density, and no weight
+            seen &= mask
     point = jnp.concatenate([_inverse(law, value) for law, value in effects], axis=-1)
     fitted = proposal.log_prob(point) + math.log(1 - _FROM_PRIOR)
     return jnp.where(seen, prior - jnp.logaddexp(prior + math.log(_FROM_PRIOR), fitted), 0.0)
@@ -368,21 +405,27 @@ def _rows_of_tips(blocks):
 
 
 def _quality(log_weights, own):
-    """Standard error at one draw, and k̂, of weights `(draws, *data, K)`; `own`: the first is not new."""
+    """Standard error at one draw, and k̂, of weights `(draws, *data, K)`; `own` are not new."""
     size = log_weights.shape[-1]
-    top = np.max(log_weights, axis=-1, keepdims=True)
-    relative = np.exp(log_weights - np.where(top == -np.inf, 0.0, top))
-    mean = np.mean(relative, axis=-1)
-    variance = np.var(relative[..., own:], axis=-1, ddof=1) / np.where(mean == 0, 1.0, mean) ** 2
-    with np.errstate(divide="ignore"):
-        others = np.log((size * mean[..., None] - relative).clip(0.0) / (size - 1))
-        ratios = log_weights - np.where(top == -np.inf, 0.0, top) - others
-    ratios = np.where(relative == 0, -np.inf, ratios)[..., own:]
+    total = np.logaddexp.reduce(log_weights, axis=-1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(total == -np.inf, 1 / size, np.exp(log_weights - total))
+        # without the largest the sum is taken anew: its difference from the total may be rounding
+        largest = np.arange(size) == np.argmax(log_weights, axis=-1)[..., None]
+        rest = np.where(largest, -np.inf, log_weights)
+        others = np.where(
+            largest,
+            np.logaddexp.reduce(rest, axis=-1, keepdims=True),
+            total + np.log1p(-shares),
+        )
+        ratios = log_weights - (others - np.log(size - 1))
+    ratios = np.where(log_weights == -np.inf, -np.inf, ratios)[..., own:]
     ratios = np.moveaxis(ratios, 0, -2).reshape(*log_weights.shape[1:-1], -1)
     # weights that are equal but for rounding have no tail to be judged by
-    equal = np.nanmax(np.abs(ratios), axis=-1, keepdims=True, initial=0.0) < _EQUAL
-    ratios = np.where(equal & ~np.isnan(ratios), 0.0, ratios)
-    return np.sqrt(np.mean(variance, axis=0) / size), np.asarray(weights.pareto_k(ratios))
+    equal = np.all(np.abs(ratios) < _EQUAL, axis=-1, keepdims=True)
+    shapes = weights.pareto_k(jnp.asarray(np.where(equal, 0.0, ratios)))
+    variance = np.var(shares[..., own:], axis=-1, ddof=1)  # of K weights with mean 1/K
+    return np.sqrt(size * np.mean(variance, axis=0)), np.asarray(shapes)
 
 
 def _warn_of_tails(shapes, size):
@@ -391,7 +434,8 @@ def _warn_of_tails(shapes, size):
         if len(places):
             which = ", ".join(str(tuple(map(int, place))) for place in places[:5])
             warnings.warn(
-                f"`{name}`: the weights by which {len(places)} of {k.size} data are integrated have too heavy a tail, "
-                f"k̂ up to {np.max(k):.2f} (data {which}). Choose a better guide.",
+                f"`{name}`: the weights by which {len(places)} of {k.size} data are integrated "
+                f"have too heavy a tail, k̂ up to {np.max(k):.2f} (data {which}). Choose a better "
+                "guide.",
                 stacklevel=3,
             )
