@@ -48,6 +48,7 @@ from .infer import (
     TemperedEvidence as TemperedEvidence,
     estimate_model_evidence as estimate_model_evidence,
     estimate_tree_evidence as estimate_tree_evidence,
+    log_likelihood as log_likelihood,
     to_arviz as to_arviz,
 )
 from .kernels import (

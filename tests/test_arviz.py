@@ -115,16 +115,19 @@ def test_posterior_is_without_the_noise(mcmc, data):
         data.posterior["mean"], mcmc.get_samples(group_by_chain=True)["mean"]
     )
     assert len(arviz.summary(data)) == 2
-    kept = nb.to_arviz(mcmc, noise=True).posterior["wing_noise"]
+    kept = nb.to_arviz(mcmc, noise=True, log_likelihood=False).posterior["wing_noise"]
     assert kept.shape == (2, DRAWS, N, STEPS, 2, 1) and kept.dims[2] == "specimens"
 
 
 def test_log_likelihood_is_pointwise(mcmc, data):
+    """The guide of a linear SDE is exact: nothing is left of the noise, and any will do."""
     assert set(data.log_likelihood.data_vars) == {"wing"}
     found = data.log_likelihood["wing"]
-    assert found.dims == ("chain", "draw", "specimens") and found.shape == (2, DRAWS, N)
+    assert found.dims == ("chain", "draw", "specimens") and found.shape == (2, 100, N)
+    draws = np.asarray(found["draw"])
+    assert draws[0] == 0 and draws[-1] == DRAWS - 1 and np.all(np.diff(draws) >= 10)
     expected = log_likelihood(model, mcmc.get_samples(), DATA)["wing"].reshape(2, DRAWS, N)
-    np.testing.assert_allclose(found, expected)
+    np.testing.assert_allclose(found, expected[:, draws])
 
 
 def test_leave_one_out(data):
@@ -240,13 +243,32 @@ def test_without_noise(several):
     del samples["wing_noise"]
     mcmc = made_up_run(NUTS(two_sites), samples)
     found = nb.to_arviz(mcmc).log_likelihood
-    assert set(found.data_vars) == {"leg", "size"}
+    assert set(found.data_vars) == {"wing", "leg", "size"}
     np.testing.assert_allclose(found["size"], dist.Normal(samples["mean"], 1.0).log_prob(0.3))
-    np.testing.assert_allclose(found["leg"], several.log_likelihood["leg"], rtol=1e-12)
+    for name in ("wing", "leg"):  # of a linear SDE, whose weights do not vary
+        np.testing.assert_allclose(found[name], several.log_likelihood[name], rtol=1e-9)
     with pytest.raises(
         ValueError, match=r"has not kept \['wing_noise'\]. Run it without \['~z.wing_noise'\]"
     ):
-        nb.to_arviz(mcmc, paths=2)
+        nb.to_arviz(mcmc, paths=2, log_likelihood=False)
+
+
+def test_parameters_that_were_dropped():
+    samples = made_up_run(NUTS(two_sites)).get_samples(group_by_chain=True)
+    del samples["end"]
+    data = nb.to_arviz(made_up_run(NUTS(two_sites), samples))
+    assert set(data.log_likelihood.data_vars) == {"wing", "size"}
+
+
+def test_log_likelihood_on_request(mcmc):
+    found = nb.log_likelihood(mcmc, num_particles=8, draws=6)
+    data = nb.to_arviz(mcmc, log_likelihood=found)
+    assert data.log_likelihood["wing"].shape == (2, 3, N) and list(data.log_likelihood["draw"]) == [
+        0,
+        499,
+        999,
+    ]
+    assert "log_likelihood" not in str(nb.to_arviz(mcmc, log_likelihood=False))
 
 
 def test_paths_that_cannot_be():
@@ -461,7 +483,11 @@ def test_predictions_of_some_draws(draws, found):
         else pytest.warns(UserWarning, match="holds draws")
     )
     with warning:
-        data = nb.to_arviz(plain_run(), posterior_predictive={"size": made_up, "other": made_up})
+        data = nb.to_arviz(
+            plain_run(),
+            log_likelihood=False,
+            posterior_predictive={"size": made_up, "other": made_up},
+        )
     assert data.posterior_predictive["size"].shape == (*found, 3, 2)
     assert data.posterior_predictive["size"].dims[2] == "specimens"
     np.testing.assert_array_equal(np.ravel(data.posterior_predictive["size"]), made_up.ravel())

@@ -575,6 +575,18 @@ def table() -> dict[str, Row]:
             noise=("flag", False),
             nodes=("flag", True),
             paths="count?",
+            log_likelihood=("flag", False),
+        ),
+        "log_likelihood": row(
+            nb.log_likelihood,
+            True,
+            mcmc=("mcmc", MCMC(infer.FunctionSpaceHMC(model), num_warmup=1, num_samples=1)),
+            key="key?",
+            num_particles=("count from 8", 8),
+            draws="count?",
+        ),
+        "infer.integrate_noise": row(
+            infer.integrate_noise, False, model=("function", model), num_particles=("count", 2)
         ),
         "infer.fields": row(infer.fields, kernel=("kernel of MCMC", infer.FunctionSpaceHMC(model))),
         "infer.init_to_guided_mean": row(
@@ -988,6 +1000,7 @@ MADE_BY_THE_LIBRARY = {
     "Alignment",
     "Stack",
     "EvidenceEstimate",
+    "LogLikelihood",
     "TemperedEvidence",
     "Comparison",
     "Shapes",

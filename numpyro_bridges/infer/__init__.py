@@ -11,6 +11,8 @@ from ._hmc import (
     FunctionSpaceHMC as FunctionSpaceHMC,
     FunctionSpaceHMCState as FunctionSpaceHMCState,
 )
+from ._integrate_noise import integrate_noise as integrate_noise
+from ._log_likelihood import LogLikelihood as LogLikelihood, log_likelihood as log_likelihood
 from ._pcn import PCN as PCN, PCNL as PCNL, PCNState as PCNState
 from ._posterior import init_to_guided_mean as init_to_guided_mean, noise_sites as noise_sites
 from ._pseudo_marginal import (

@@ -1,11 +1,10 @@
 """Results for ArviZ: 0.x, an `InferenceData`, and 1.x, a `DataTree`.
 
-The driving noise is left out: thousands of numbers, none of them of interest. The log likelihood
-log p(v_i | z_i, θ) is conditional on it, and good for leave-one-out all the same: p(v | θ) is its
-mean over z ~ N(0, I), so that E[1/p(v_i | z_i, θ)] over the posterior of (z, θ) is E[1/p(v_i | θ)]
-over that of θ, the same estimand. The spread of the bridge's weights adds to that of the importance
-ratios: read Pareto k̂. The data of a tree are left out node by node,
-`DiffusionTree.log_prob_by_node`.
+The driving noise is left out: thousands of numbers, none of them of interest. The log likelihood is
+that of `log_likelihood`, with noise and effects of a unit integrated out. What is conditional on
+them, log p(v_i | z, u, θ), has the same harmonic mean over the posterior; but that is a mean of
+weights whose spread grows with what the datum says of z and u, and leave-one-out by it is off by
+many nats.
 """
 
 import warnings
@@ -14,14 +13,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
-from numpyro.distributions import ExpandedDistribution, Independent, MaskedDistribution
 from numpyro.infer import MCMC
 from numpyro.ops.provenance import eval_provenance
 
-from .._checks import flag, positive_integer, require, require_instance, require_mapping
-from ..distributions import AbstractNoiseDriven, DiffusionEndpoint, DiffusionTree
+from .._checks import flag, positive_integer, require, require_mapping
+from ..distributions import DiffusionEndpoint, DiffusionTree
 from ._controls import has_controls, missing_variance, warn_of_missing
+from ._draws import is_datum, mask_of, model_of, spaced, with_noise
+from ._log_likelihood import LogLikelihood, log_likelihood as integrated
 from ._posterior import is_latent, is_noise, sites_of
 from ._statistics import statistics
 
@@ -36,6 +35,7 @@ def to_arviz(
     noise: bool = False,
     nodes: bool = True,
     paths: int | None = None,
+    log_likelihood: bool | LogLikelihood = True,
 ) -> Any:
     """The result of an MCMC run, for ArviZ.
 
@@ -53,19 +53,20 @@ def to_arviz(
       noise was kept.
     - `paths`: the bridges of how many draws of each chain to add, evenly spaced, at most all whose
       noise was kept; none by default.
+    - `log_likelihood`: what `nb.log_likelihood(mcmc, ...)` has returned, for leave-one-out by
+      `arviz.loo`. By default it is asked for as it is: 200 draws of 16 particles. `False`: none.
 
     **Returns:** an `InferenceData` (ArviZ 0.x) or a `DataTree` (1.x) with the groups of the
     dictionaries and
 
     - `posterior`, and `observed_data`. Data masked in every draw (`handlers.mask`, `obs_mask`) are
       NaN.
-    - `log_likelihood`: one value for each datum of each observed site (`numpyro.factor` sites are
-      no data). Left out are sites that need what the run has not kept, such as noise dropped by
-      `extra_fields=("~z.wing_noise",)`, and data masked in every draw, which say nothing: where a
-      site has some, its seen data are one axis, `wing_seen`, and coordinates such as
-      `wing_specimens` say which they are. `handlers.scale` does not enter: the value is that of one
-      datum, counted once. A `DiffusionTree` has one value for each seen node, on the axis `node`,
-      for leave-one-out given all other nodes.
+    - `log_likelihood`: one value for each datum of each observed site, with its noise and the
+      effects of its unit integrated out (`nb.log_likelihood` says how, and which data have none;
+      `numpyro.factor` sites are no data). Its draws are some of those of the posterior. Left out
+      are data masked in every draw, which say nothing: where a site has some, its seen data are one
+      axis, `wing_seen`, and coordinates such as `wing_specimens` say which they are. A
+      `DiffusionTree` has one value for each seen node, on the axis `node`.
     - `posterior_nodes`: of each observed `DiffusionTree` the states, with axes `chain`, `draw`, the
       plates, `node`, `point` (unless states are vectors) and `coordinate`: ancestors, and tips
       behind their errors. Nodes without a name are `node 7`, by their number in the tree. Left out
@@ -90,7 +91,7 @@ def to_arviz(
     without its noise, for predictions that are not draws of this run, and for names that differ
     only in `/` and `.`.
     """
-    require_instance(mcmc, MCMC, "mcmc", "an `MCMC` of NumPyro")
+    model, replay = model_of(mcmc)
     for name, groups in (
         ("prior", prior),
         ("posterior_predictive", posterior_predictive),
@@ -100,13 +101,10 @@ def to_arviz(
         require_mapping(groups, name)
     noise, nodes = flag(noise, "noise"), flag(nodes, "nodes")
     paths = None if paths is None else positive_integer(paths, "paths")
-    model = getattr(mcmc.sampler, "model", None)
-    require(
-        callable(model),
-        "`mcmc` must run a NumPyro model: one with a `potential_fn` of its own has no sites.",
-    )
+    if not isinstance(log_likelihood, LogLikelihood):
+        log_likelihood = flag(log_likelihood, "log_likelihood")
     sites = sites_of(model, mcmc._args, mcmc._kwargs)
-    observed = {name: site["value"] for name, site in sites.items() if _is_datum(site)}
+    observed = {name: site["value"] for name, site in sites.items() if is_datum(site)}
     hidden = set() if noise else {name for name, site in sites.items() if is_noise(site)}
     dims = {
         _plain(name): [_plain(axis) for axis in axes]
@@ -121,32 +119,22 @@ def to_arviz(
     samples = mcmc.get_samples(group_by_chain=True)
     shape = next(iter(samples.values())).shape[:2]
 
-    def replay(values, names):
-        at_values = numpyro.handlers.substitute(numpyro.handlers.seed(model, 0), data=values)
-        trace = numpyro.handlers.trace(at_values).get_trace(*mcmc._args, **mcmc._kwargs)
-        return {name: (trace[name]["fn"], trace[name]["value"]) for name in names}
+    def at(values, names):
+        return replay(lambda site: values.get(site["name"]), names)
 
     def masks(values, names):
-        return {name: _mask_of(law) for name, (law, _) in replay(values, names).items()}
-
-    def log_likelihood(values, names):
-        found = replay(values, names).items()
-        return {
-            name: law.log_prob_by_node(v) if name in trees else law.log_prob(v)
-            for name, (law, v) in found
-        }
+        return {name: mask_of(law) for name, (law, _) in at(values, names).items()}
 
     def states(values, names):
-        return {name: _states(law, value) for name, (law, value) in replay(values, names).items()}
+        return {name: _states(law, value) for name, (law, value) in at(values, names).items()}
 
     def bridges(values, names):
         return {
-            name: (law.path(value), law.times)
-            for name, (law, value) in replay(values, names).items()
+            name: (law.path(value), law.times) for name, (law, value) in at(values, names).items()
         }
 
     def missing(values, names):
-        return {name: missing_variance(law) for name, (law, _) in replay(values, names).items()}
+        return {name: missing_variance(law) for name, (law, _) in at(values, names).items()}
 
     def visible(draws):
         return {name: value for name, value in draws.items() if name not in hidden}
@@ -170,20 +158,23 @@ def to_arviz(
             name for name, sources in needs.items() if frozenset().union(*jax.tree.leaves(sources))
         }
 
-    lacking = unknown(log_likelihood, observed, samples)
-    known = [name for name in observed if name not in lacking]
-    masked = [name for name in observed if _mask_of(sites[name]["fn"]) is not None]
+    masked = [name for name in observed if mask_of(sites[name]["fn"]) is not None]
     seen = _mapped(lambda draw: masks(lost(samples) | draw, masked), samples) if masked else {}
     seen = {name: mask.any(axis=(0, 1)) for name, mask in seen.items()}
     datasets = {}
-    if known:
-        found = _mapped(lambda draw: log_likelihood(lost(samples) | draw, known), samples)
-        axes = {
-            name: _leading_axes(name, value.ndim - 2 - (name in trees), dims)
-            for name, value in found.items()
-        }
+    found = integrated(mcmc) if log_likelihood is True else log_likelihood
+    if found:
         own = {name: _labels(tree, dict.fromkeys(tree.observed)) for name, tree in trees.items()}
-        datasets["log_likelihood"] = _seen_only(found, seen, axes, coords, own)
+        axes, counted = {}, {}
+        for name, (first, *others) in found.sites.items():
+            number = found.values[name].ndim - 2 - (first in trees)
+            axes[name] = _leading_axes(first, number, dims)
+            if all(site in seen for site in (first, *others)):
+                counted[name] = np.any(
+                    [_whole(seen[site], number) for site in (first, *others)], axis=0
+                )
+        data = _seen_only(found.values, counted, axes, coords, own)
+        datasets["log_likelihood"] = data.assign_coords(draw=_numbers(coords, found.draws))
     controlled = [name for name in observed if has_controls(sites[name]["fn"])]
     if controlled and not unknown(missing, controlled, samples):
         for name, found in _mapped(
@@ -191,7 +182,7 @@ def to_arviz(
         ).items():
             warn_of_missing(name, found, sites[name]["fn"])
     if nodes and trees:
-        draws, driving = _with_noise(mcmc)
+        draws, driving = with_noise(mcmc)
         if not unknown(states, trees, driving):
             found = _mapped(lambda draw: states(lost(driving) | draw, trees), driving)
             leading = {
@@ -199,8 +190,8 @@ def to_arviz(
             }
             datasets["posterior_nodes"] = _of_nodes(found, leading, draws, coords, trees)
     if paths is not None:
-        draws, driving = _with_noise(mcmc)
-        places = np.linspace(0, len(draws) - 1, min(paths, len(draws))).astype(int)
+        draws, driving = with_noise(mcmc)
+        places = spaced(len(draws), paths)
         kept = draws[places]
         driven = [
             n for n in observed if isinstance(sites[n]["fn"], (DiffusionEndpoint, DiffusionTree))
@@ -246,24 +237,6 @@ def to_arviz(
     return _from_groups(groups, datasets, coords, dims)
 
 
-def _with_noise(mcmc):
-    """Indices of the draws whose noise is there, and the values of those draws."""
-    samples = mcmc.get_samples(group_by_chain=True)
-    draws = np.arange(next(iter(samples.values())).shape[1])
-    noise, every = (
-        mcmc.get_extra_fields(group_by_chain=True).get("noise"),
-        getattr(mcmc, "_keep_noise", None),
-    )
-    if not isinstance(noise, dict) or not every or every > len(draws):
-        return draws, samples
-    draws = draws[every - 1 :: every]
-    return draws, {name: value[:, draws] for name, value in samples.items()} | noise
-
-
-def _is_datum(site) -> bool:
-    return bool(site.get("is_observed")) and not site["infer"].get("is_auxiliary")
-
-
 def _plates(sites) -> dict:
     """Names of the leading axes of each site, from its plates."""
     frames = {
@@ -306,25 +279,9 @@ def _by_chain(draws, ndims, shape) -> dict:
     return {name: value.reshape(axes + value.shape[number:]) for name, value in draws.items()}
 
 
-def _mask_of(law):
-    """Which data count, booleans with the axes of the batch in front, or `None` where no mask is.
-
-    Axes that `to_event` has made part of a datum follow those of the batch.
-    """
-    if isinstance(law, AbstractNoiseDriven):
-        return law._mask
-    if not isinstance(law, (ExpandedDistribution, Independent, MaskedDistribution)):
-        return None
-    inner = _mask_of(law.base_dist)
-    if isinstance(law, Independent):
-        return inner
-    own = jnp.asarray(law._mask if isinstance(law, MaskedDistribution) else True)
-    if inner is None and isinstance(law, ExpandedDistribution):
-        return None
-    inner = jnp.ones((), bool) if inner is None else inner
-    inside = inner.shape[len(law.base_dist.batch_shape) :]
-    own = own.reshape(own.shape + (1,) * len(inside))
-    return jnp.broadcast_to(inner & own, law.batch_shape + inside)
+def _whole(mask, number):
+    """Whether anything counts of each datum, of as many axes."""
+    return mask.any(axis=tuple(range(number, mask.ndim)))
 
 
 def _without(value, mask):
@@ -396,9 +353,7 @@ def _seen_only(found, seen, axes, coords, nodes):
     )
     for name, values in found.items():
         last = [_axis(name, "node", nodes)] if name in nodes else []
-        number = values.ndim - 2 - len(last)
         mask = seen.get(name, np.ones((), bool))
-        mask = mask.any(axis=tuple(range(number, mask.ndim)))
         if mask.all():
             variables[name] = (["chain", "draw", *axes[name], *last], values)
         elif mask.any():

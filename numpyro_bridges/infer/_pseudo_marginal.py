@@ -27,6 +27,7 @@ from jax.sharding import Mesh
 
 from .. import weights
 from .._checks import concrete, known_number, positive_integer, require
+from ._draws import surely_heavy
 from ._kernel import POSITIVE, PROPORTION_OR_0, UNSEALED, AbstractBridgeKernel
 from ._posterior import Sites, driven_by, energies_of, groups_of, init_to_guided_mean
 from ._reference import Windows, start_windows, update_windows
@@ -323,15 +324,12 @@ def _choose(log_weights, largest: int) -> int:
 def _warn_of_tails(log_weights) -> None:
     """A warning where weights `(data, bridges)` cannot tell how much a log estimate varies.
 
-    The log forgives more than a mean does, and one k̂ in many is large by chance: their average has
-    to be below 1, beyond which there is no mean to be estimated, and none may be above the
-    threshold by two standard errors.
+    The log forgives more than a mean does: the average k̂ has to be below 1, beyond which there is
+    no mean to be estimated, and none may surely be above the threshold.
     """
     with jax.ensure_compile_time_eval():
         shapes = np.clip(np.asarray(weights.pareto_k(log_weights)), 0.0, 2.0)
-    # (1 + k)/√M is the standard error of a shape from the M largest weights, here about 3 √S of S
-    surely = shapes - 2 * (1 + shapes) / np.sqrt(3 * np.sqrt(log_weights.shape[1]))
-    if np.mean(shapes) < 1 and np.max(surely) < weights.pareto_k_threshold(log_weights.shape[1]):
+    if np.mean(shapes) < 1 and not np.any(surely_heavy(shapes, log_weights.shape[1])):
         return
     warnings.warn(
         "the number of particles is chosen by weights with too heavy a tail: k̂ is "
