@@ -25,7 +25,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._linalg import apply, cholesky, promote, transpose
-from .._types import State
+from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import ExactMatch, GaussianMessage, gaussian_log_density
 from ..guiding import AbstractGuide, Unguided, default_guide
@@ -46,7 +46,9 @@ class Cloud(eqx.Module):
     rho: Float[Array, " K"]
 
 
-def adjoint_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, *, stride=jnp.inf) -> Cloud:
+def adjoint_cloud(
+    bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, *, stride: RealScalar = jnp.inf
+) -> Cloud:
     """h(t, ·) of a bridge: the reversed process from what is observed, weighted by exp ∫ c."""
     key_start, key = jr.split(key)
     reverse = ReversedSDE(bridge.sde, bridge.shown_ts[-1])
@@ -70,7 +72,7 @@ def adjoint_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, 
 
 
 def reversal_cloud(
-    bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray, size: int, rho=None, *, stride=jnp.inf
+    bridge: GuidedBridge, guide: AbstractGuide, key: PRNGKeyArray, size: int, rho=None, *, stride: RealScalar = jnp.inf
 ) -> Cloud:
     """h(t, ·) of a bridge, at points of its conditioned paths: time reversals, led to x0 by a guide of their own."""
     key_start, key_path, key = jr.split(key, 3)
@@ -154,7 +156,9 @@ def ends(bridge: GuidedBridge, key: PRNGKeyArray, size: int) -> Array:
     return paths[:, -1][_systematic(key_resample, jax.nn.softmax(log_weights))]
 
 
-def forward_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, *, stride=jnp.inf) -> Cloud:
+def forward_cloud(
+    bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, *, stride: RealScalar = jnp.inf
+) -> Cloud:
     """p(t, ·) of an SDE from x0; `bridge` is the reversed one, which is conditioned on x0."""
     assert isinstance(bridge.sde, ReversedSDE)
     sde, clock, x0 = bridge.sde.sde, bridge.sde.clock, bridge.end()[1]
@@ -204,7 +208,9 @@ def _within(bridge: GuidedBridge, t, dt, y: State, stride) -> Array:
     return jnp.all(jnp.isfinite(y)) & (step <= stride)
 
 
-def _cloud(bridge, key, y, advance, log_pair, log_weight, rho, given=None, logits=None, stride=jnp.inf) -> Cloud:
+def _cloud(
+    bridge, key, y, advance, log_pair, log_weight, rho, given=None, logits=None, stride: RealScalar = jnp.inf
+) -> Cloud:
     """Particles y `(B, n, dim)` from the end of the bridge's grid to its start.
 
     `advance(times, y, key, given)` moves one, `log_pair(times, y, new)` is ℓ, `log_weight(times, y)` what it gains;
@@ -225,7 +231,8 @@ def _cloud(bridge, key, y, advance, log_pair, log_weight, rho, given=None, logit
         within = jax.vmap(lambda y: _within(bridge, t0, t1 - t0, y, stride))(new)
         new = jnp.where(within.reshape(-1, *[1] * (y.ndim - 1)), new, y)
         pull, push = jax.vmap(jax.grad(log_pair, (1, 2)), (None, 0, 0))(times, y, new)
-        logits = jnp.where(within, logits + jax.vmap(log_weight, (None, 0))(times, y), -jnp.inf)
+        gained: Array = logits + jax.vmap(log_weight, (None, 0))(times, y)
+        logits = jnp.where(within, gained, -jnp.inf)
         weights = jnp.where(jnp.all(jnp.isneginf(logits)), 0.0, jax.nn.softmax(logits))
         past = g + pull
         if rho is None:
