@@ -216,7 +216,14 @@ def cell(quick) -> Iterator[tuple[str, Case]]:
 
         def truth(end=end):
             return chain(
-                lambda x: drift(x, np), 0.1, [0.1, -0.1], end, ts, [-0.7, -0.7], [2.6, 1.7], 0.005
+                lambda x: drift(x, np),
+                0.1,
+                [0.1, -0.1],
+                end,
+                ts,
+                [-0.5, -0.6],
+                [end[0] + 0.9, 1.3],
+                0.007,
             )
 
         yield name, Case(bridge, truth, base=aux)

@@ -28,7 +28,7 @@ import jax.random as jr
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._linalg import apply, cholesky, promote, transpose
-from .._types import State
+from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import ExactMatch, GaussianMessage, gaussian_log_density
 from ..guiding import AbstractGuide, Unguided, default_guide
@@ -51,7 +51,7 @@ class Cloud(eqx.Module):
 
 
 def adjoint_cloud(
-    bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, *, stride=jnp.inf
+    bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, *, stride: RealScalar = jnp.inf
 ) -> Cloud:
     """h(t, ·) of a bridge: the reversed process from what is observed, weighted by exp ∫ c."""
     key_start, key = jr.split(key)
@@ -82,7 +82,7 @@ def reversal_cloud(
     size: int,
     rho=None,
     *,
-    stride=jnp.inf,
+    stride: RealScalar = jnp.inf,
 ) -> Cloud:
     """h(t, ·) of a bridge, at points of its conditioned paths: time reversals, led to x0 by a guide
     of their own.
@@ -172,7 +172,7 @@ def ends(bridge: GuidedBridge, key: PRNGKeyArray, size: int) -> Array:
 
 
 def forward_cloud(
-    bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, *, stride=jnp.inf
+    bridge: GuidedBridge, key: PRNGKeyArray, size: int, rho=None, *, stride: RealScalar = jnp.inf
 ) -> Cloud:
     """p(t, ·) of an SDE from x0; `bridge` is the reversed one, which is conditioned on x0."""
     assert isinstance(bridge.sde, ReversedSDE)
@@ -228,7 +228,16 @@ def _within(bridge: GuidedBridge, t, dt, y: State, stride) -> Array:
 
 
 def _cloud(
-    bridge, key, y, advance, log_pair, log_weight, rho, given=None, logits=None, stride=jnp.inf
+    bridge,
+    key,
+    y,
+    advance,
+    log_pair,
+    log_weight,
+    rho,
+    given=None,
+    logits=None,
+    stride: RealScalar = jnp.inf,
 ) -> Cloud:
     """Particles y `(B, n, dim)` from the end of the bridge's grid to its start.
 
@@ -251,7 +260,8 @@ def _cloud(
         within = jax.vmap(lambda y: _within(bridge, t0, t1 - t0, y, stride))(new)
         new = jnp.where(within.reshape(-1, *[1] * (y.ndim - 1)), new, y)
         pull, push = jax.vmap(jax.grad(log_pair, (1, 2)), (None, 0, 0))(times, y, new)
-        logits = jnp.where(within, logits + jax.vmap(log_weight, (None, 0))(times, y), -jnp.inf)
+        gained: Array = logits + jax.vmap(log_weight, (None, 0))(times, y)
+        logits = jnp.where(within, gained, -jnp.inf)
         weights = jnp.where(jnp.all(jnp.isneginf(logits)), 0.0, jax.nn.softmax(logits))
         past = g + pull
         if rho is None:

@@ -54,7 +54,7 @@ from ._clouds import (
     whiten,
 )
 from ._networks import MLP, ROWWISE, PointNetwork, over_batch
-from ._training import Training, train
+from ._training import Loss, Training, train
 
 _LEAST_HELD_OUT = 16  # independent differences: with fewer their standard error is itself unknown
 _STRIDE = 0.5  # of clouds, in the largest displacement of the guide's paths
@@ -73,7 +73,7 @@ class Problem(NamedTuple):
     training: Training
     train: Callable
     mesh: Mesh | None = None
-    stride: Array | float = jnp.inf
+    stride: RealScalar = jnp.inf
     """Of the clouds, see `_clouds`."""
 
     def spread(self, fn: Callable, size: int) -> Callable:
@@ -347,7 +347,7 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     ]
     rho = _coefficients(problem._replace(draw=draws[0]), forward, key_pilot)
 
-    def candidate(draw):
+    def candidate(draw) -> tuple[Problem, Loss, Callable]:
         back = problem._replace(draw=draw, guide=replace(start, guide=draw(key).guide))
         loss = _regression(back, _clouds(back, forward, rho), _draws(back))
 
@@ -537,7 +537,7 @@ def _plan(problem: Problem, network, bridge: GuidedBridge) -> ScorePlan:
     return plan
 
 
-def _regression(problem: Problem, rows: Callable, draws: int):
+def _regression(problem: Problem, rows: Callable, draws: int) -> Loss:
     """The loss of score matching, ∫ E |s − (g − ∇log h̃)|²_a dt / T.
 
     `rows(network, key, *prepared)` are the inputs of the network and the loss as a function of its
