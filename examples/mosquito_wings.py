@@ -76,7 +76,8 @@ def model(observed=None, num_specimens=None):
 
 # %%
 kernel = nb.infer.FunctionSpaceHMC(model)
-mcmc = MCMC(kernel, num_warmup=num_warmup, num_samples=num_samples, num_chains=4, chain_method="vectorized")
+settings = {"num_warmup": num_warmup, "num_samples": num_samples, "num_chains": 4}
+mcmc = MCMC(kernel, chain_method="vectorized", progress_bar=False, **settings)  # of two devices a bar compiles twice
 start = time.perf_counter()
 mcmc.run(jr.key(arguments.seed), points, extra_fields=nb.infer.fields(kernel))
 posterior = jax.block_until_ready(mcmc.get_samples())
