@@ -124,9 +124,9 @@ def model(observed=None, num_specimens=None):
 
 # %%
 kernel = nb.infer.FunctionSpaceHMC(model)
-mcmc = MCMC(
-    kernel, num_warmup=num_warmup, num_samples=num_samples, num_chains=4, chain_method="vectorized"
-)
+settings = {"num_warmup": num_warmup, "num_samples": num_samples, "num_chains": 4}
+# of two devices a bar compiles twice
+mcmc = MCMC(kernel, chain_method="vectorized", progress_bar=False, **settings)
 start = time.perf_counter()
 mcmc.run(jr.key(arguments.seed), points, extra_fields=nb.infer.fields(kernel))
 posterior = jax.block_until_ready(mcmc.get_samples())
