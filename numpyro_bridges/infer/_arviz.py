@@ -91,7 +91,6 @@ def to_arviz(
     without its noise, for predictions that are not draws of this run, and for names that differ
     only in `/` and `.`.
     """
-    model, replay = model_of(mcmc)
     for name, groups in (
         ("prior", prior),
         ("posterior_predictive", posterior_predictive),
@@ -99,142 +98,194 @@ def to_arviz(
         ("dims", dims),
     ):
         require_mapping(groups, name)
-    noise, nodes = flag(noise, "noise"), flag(nodes, "nodes")
+    noise = flag(noise, "noise")
+    nodes = flag(nodes, "nodes")
     paths = None if paths is None else positive_integer(paths, "paths")
     if not isinstance(log_likelihood, LogLikelihood):
         log_likelihood = flag(log_likelihood, "log_likelihood")
-    sites = sites_of(model, mcmc._args, mcmc._kwargs)
-    observed = {name: site["value"] for name, site in sites.items() if is_datum(site)}
-    hidden = set() if noise else {name for name, site in sites.items() if is_noise(site)}
-    dims = {
-        _plain(name): [_plain(axis) for axis in axes]
-        for name, axes in (_plates(sites) | (dims or {})).items()
+    run = _Run(mcmc, noise, coords or {}, dims or {})
+    seen = run.seen()
+    found = integrated(mcmc) if log_likelihood is True else log_likelihood
+    datasets = {}
+    if found:
+        datasets["log_likelihood"] = _log_likelihood(run, found, seen)
+    _warn_of_controls(run)
+    if nodes and run.trees:
+        datasets |= _nodes(run)
+    if paths is not None:
+        datasets["posterior_paths"] = _paths(run, paths)
+    if posterior_predictive:
+        datasets["posterior_predictive"] = _predictive(run, posterior_predictive)
+    fields = mcmc.get_extra_fields(group_by_chain=True)
+    groups = {
+        "posterior": run.visible(run.samples),
+        "sample_stats": statistics(fields, mcmc.sampler),
+        "observed_data": {
+            name: _without(value, seen.get(name)) for name, value in run.observed.items()
+        },
     }
-    coords = _plainly(coords or {})
-    trees = {
-        name: sites[name]["fn"].tree
-        for name in observed
-        if isinstance(sites[name]["fn"], DiffusionTree)
-    }
-    samples = mcmc.get_samples(group_by_chain=True)
-    shape = next(iter(samples.values())).shape[:2]
+    if prior is not None:
+        groups |= _prior(run, prior)
+    groups = {group: jax.device_get(values) for group, values in groups.items() if values}
+    return _from_groups(groups, datasets, run.coords, run.dims)
 
-    def at(values, names):
-        return replay(lambda site: values.get(site["name"]), names)
 
-    def masks(values, names):
-        return {name: mask_of(law) for name, (law, _) in at(values, names).items()}
+class _Run:
+    """A run, and what its model says at its draws.
 
-    def states(values, names):
-        return {name: _states(law, value) for name, (law, value) in at(values, names).items()}
+    - `sites`: those of a trace of the model, by name; `observed`: the data of those that have some,
+      `trees`: the trees of observed `DiffusionTree`s, `hidden`: sites that are not to be shown.
+    - `samples`: with axes for chains and draws.
+    """
 
-    def bridges(values, names):
-        return {
-            name: (law.path(value), law.times) for name, (law, value) in at(values, names).items()
+    def __init__(self, mcmc, noise, coords, dims):
+        model, self._replay = model_of(mcmc)
+        self.mcmc = mcmc
+        self.sites = sites_of(model, mcmc._args, mcmc._kwargs)
+        self.observed = {name: s["value"] for name, s in self.sites.items() if is_datum(s)}
+        self.hidden = set() if noise else {name for name, s in self.sites.items() if is_noise(s)}
+        self.trees = {
+            name: self.law(name).tree
+            for name in self.observed
+            if isinstance(self.law(name), DiffusionTree)
         }
+        self.samples = mcmc.get_samples(group_by_chain=True)
+        self.coords = _plainly(coords)
+        axes_of = _plates(self.sites) | dims
+        self.dims = {_plain(name): [_plain(a) for a in axes] for name, axes in axes_of.items()}
 
-    def missing(values, names):
-        return {name: missing_variance(law) for name, (law, _) in at(values, names).items()}
+    def law(self, name):
+        return self.sites[name]["fn"]
 
-    def visible(draws):
-        return {name: value for name, value in draws.items() if name not in hidden}
+    def visible(self, draws):
+        return {name: value for name, value in draws.items() if name not in self.hidden}
 
-    def lost(samples):
+    def lost(self, samples):
+        """Values of the latent sites that these samples have not kept: any will do, where what is
+        asked for does not need them.
+        """
         return {
             name: site["value"]
-            for name, site in sites.items()
+            for name, site in self.sites.items()
             if is_latent(site) and name not in samples
         }
 
-    def unknown(fn, names, samples):
-        """Names of the sites for which `fn` needs what is lost."""
+    def at(self, of, names, values):
+        """`of(law, value)` of each of the sites, at these values of all latent ones."""
+        found = self._replay(lambda site: values.get(site["name"]), names)
+        return {name: of(law, value) for name, (law, value) in found.items()}
+
+    def over_draws(self, of, names, samples, places=None):
+        """The same for each draw of the samples, or for those in some places."""
+        lost = self.lost(samples)
+        return _mapped(lambda draw: self.at(of, names, lost | draw), samples, places)
+
+    def unknown(self, of, names, samples):
+        """Names of the sites for which `of` needs what is lost."""
+        lost = self.lost(samples)
+        if not lost:
+            return set()
         first = {name: value[0, 0] for name, value in samples.items()}
-        needs = (
-            eval_provenance(lambda lost: fn(first | lost, names), lost=lost(samples))
-            if lost(samples)
-            else {}
-        )
+        needs = eval_provenance(lambda lost: self.at(of, names, first | lost), lost=lost)
         return {
             name for name, sources in needs.items() if frozenset().union(*jax.tree.leaves(sources))
         }
 
-    masked = [name for name in observed if mask_of(sites[name]["fn"]) is not None]
-    seen = _mapped(lambda draw: masks(lost(samples) | draw, masked), samples) if masked else {}
-    seen = {name: mask.any(axis=(0, 1)) for name, mask in seen.items()}
-    datasets = {}
-    found = integrated(mcmc) if log_likelihood is True else log_likelihood
-    if found:
-        own = {name: _labels(tree, dict.fromkeys(tree.observed)) for name, tree in trees.items()}
-        axes, counted = {}, {}
-        for name, (first, *others) in found.sites.items():
-            number = found.values[name].ndim - 2 - (first in trees)
-            axes[name] = _leading_axes(first, number, dims)
-            if all(site in seen for site in (first, *others)):
-                counted[name] = np.any(
-                    [_whole(seen[site], number) for site in (first, *others)], axis=0
-                )
-        data = _seen_only(found.values, counted, axes, coords, own)
-        datasets["log_likelihood"] = data.assign_coords(draw=_numbers(coords, found.draws))
-    controlled = [name for name in observed if has_controls(sites[name]["fn"])]
-    if controlled and not unknown(missing, controlled, samples):
-        for name, found in _mapped(
-            lambda draw: missing(lost(samples) | draw, controlled), samples
-        ).items():
-            warn_of_missing(name, found, sites[name]["fn"])
-    if nodes and trees:
-        draws, driving = with_noise(mcmc)
-        if not unknown(states, trees, driving):
-            found = _mapped(lambda draw: states(lost(driving) | draw, trees), driving)
-            leading = {
-                name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in trees
-            }
-            datasets["posterior_nodes"] = _of_nodes(found, leading, draws, coords, trees)
-    if paths is not None:
-        draws, driving = with_noise(mcmc)
-        places = spaced(len(draws), paths)
-        kept = draws[places]
-        driven = [
-            n for n in observed if isinstance(sites[n]["fn"], (DiffusionEndpoint, DiffusionTree))
-        ]
-        require(
-            driven,
-            "`paths` needs an observed `DiffusionEndpoint` or `DiffusionTree`; the model observes "
-            f"{sorted(observed)}.",
-        )
-        require(
-            not unknown(bridges, driven, driving),
-            f"`paths` needs the noise that drives {driven}, and the run has not kept "
-            f"{sorted(lost(driving))}. Run it without "
-            f"{[f'~z.{name}' for name in sorted(lost(driving))]} in `extra_fields`; if it is "
-            "checkpointed, with `keep_noise`, of at most `num_samples`.",
-        )
-        found = _mapped(lambda draw: bridges(lost(driving) | draw, driven), driving, places)
-        leading = {
-            name: _leading_axes(name, sites[name]["fn"].noise.ndim - 3, dims) for name in driven
+    def seen(self):
+        """Of the sites with a mask: which data count in any draw."""
+        masked = [name for name in self.observed if mask_of(self.law(name)) is not None]
+        if not masked:
+            return {}
+        found = self.over_draws(lambda law, _: mask_of(law), masked, self.samples)
+        return {name: mask.any(axis=(0, 1)) for name, mask in found.items()}
+
+    def leading(self, names):
+        """Of sites with driving noise: names of the axes of their batches."""
+        # a noise has three axes of its own: branches, or one, then steps and numbers
+        return {
+            name: _leading_axes(name, self.law(name).noise.ndim - 3, self.dims) for name in names
         }
-        ends = {name: _labels(tree, tree.active) for name, tree in trees.items()}
-        datasets["posterior_paths"] = _labelled(found, leading, kept, coords, ends)
-    groups = {
-        "posterior": visible(samples),
-        "sample_stats": statistics(mcmc.get_extra_fields(group_by_chain=True), mcmc.sampler),
-        "observed_data": {
-            name: _without(value, seen.get(name)) for name, value in observed.items()
-        },
-    }
-    if posterior_predictive:
-        ndims = {name: np.ndim(site["value"]) for name, site in sites.items()}
-        found = _by_chain(visible(posterior_predictive), ndims, shape)
-        axes = {name: _leading_axes(name, value.ndim - 2, dims) for name, value in found.items()}
-        variables = {name: (["chain", "draw", *axes[name]], value) for name, value in found.items()}
-        datasets["posterior_predictive"] = _dataset(variables, coords)
-    if prior is not None:
-        draws = {name: np.asarray(value)[None] for name, value in visible(prior).items()}
-        groups["prior"] = {name: value for name, value in draws.items() if name not in observed}
-        groups["prior_predictive"] = {
-            name: value for name, value in draws.items() if name in observed
-        }
-    groups = {group: jax.device_get(values) for group, values in groups.items() if values}
-    return _from_groups(groups, datasets, coords, dims)
+
+
+def _log_likelihood(run, found, seen):
+    labels = {name: _labels(tree, dict.fromkeys(tree.observed)) for name, tree in run.trees.items()}
+    axes = {}
+    counted = {}
+    # sites that share the effects of their units have one value together, under the first's name
+    for name, together in found.sites.items():
+        number = found.values[name].ndim - 2 - (together[0] in run.trees)
+        axes[name] = _leading_axes(together[0], number, run.dims)
+        if all(site in seen for site in together):
+            counted[name] = np.any([_whole(seen[site], number) for site in together], axis=0)
+    data = _seen_only(found.values, counted, axes, run.coords, labels)
+    return data.assign_coords(draw=_numbers(run.coords, found.draws))
+
+
+def _warn_of_controls(run):
+    def missing(law, _):
+        return missing_variance(law)
+
+    controlled = [name for name in run.observed if has_controls(run.law(name))]
+    if controlled and not run.unknown(missing, controlled, run.samples):
+        for name, found in run.over_draws(missing, controlled, run.samples).items():
+            warn_of_missing(name, found, run.law(name))
+
+
+def _nodes(run):
+    """The group of the nodes' states; none where their noise was not kept."""
+    draws, driving = with_noise(run.mcmc)
+    if run.unknown(_states, run.trees, driving):
+        return {}
+    found = run.over_draws(_states, run.trees, driving)
+    leading = run.leading(run.trees)
+    return {"posterior_nodes": _of_nodes(found, leading, draws, run.coords, run.trees)}
+
+
+def _paths(run, number):
+    """The group of the bridges of a number of draws of each chain."""
+
+    def bridge(law, value):
+        return law.path(value), law.times
+
+    draws, driving = with_noise(run.mcmc)
+    places = spaced(len(draws), number)
+    kinds = (DiffusionEndpoint, DiffusionTree)
+    driven = [name for name in run.observed if isinstance(run.law(name), kinds)]
+    require(
+        driven,
+        "`paths` needs an observed `DiffusionEndpoint` or `DiffusionTree`; the model observes "
+        f"{sorted(run.observed)}.",
+    )
+    lost = sorted(run.lost(driving))
+    require(
+        not run.unknown(bridge, driven, driving),
+        f"`paths` needs the noise that drives {driven}, and the run has not kept {lost}. Run it "
+        f"without {[f'~z.{name}' for name in lost]} in `extra_fields`; if it is checkpointed, with "
+        "`keep_noise`, of at most `num_samples`.",
+    )
+    found = run.over_draws(bridge, driven, driving, places)
+    ends = {name: _labels(tree, tree.active) for name, tree in run.trees.items()}
+    return _labelled(found, run.leading(driven), draws[places], run.coords, ends)
+
+
+def _predictive(run, draws):
+    shape = next(iter(run.samples.values())).shape[:2]
+    ndims = {name: np.ndim(site["value"]) for name, site in run.sites.items()}
+    variables = {}
+    for name, value in _by_chain(run.visible(draws), ndims, shape).items():
+        axes = _leading_axes(name, value.ndim - 2, run.dims)
+        variables[name] = (["chain", "draw", *axes], value)
+    return _dataset(variables, run.coords)
+
+
+def _prior(run, draws):
+    """Two groups: of what is observed, and of the rest. All draws are of one chain."""
+    prior = {}
+    predictive = {}
+    for name, value in run.visible(draws).items():
+        group = predictive if name in run.observed else prior
+        group[name] = np.asarray(value)[None]
+    return {"prior": prior, "prior_predictive": predictive}
 
 
 def _plates(sites) -> dict:
@@ -273,7 +324,7 @@ def _by_chain(draws, ndims, shape) -> dict:
         warnings.warn(
             f"`posterior_predictive` holds draws {axes} of a run of {shape[0]} chains and "
             f"{shape[1]} draws: its chains and draws are not those of the posterior.",
-            stacklevel=3,
+            stacklevel=4,
         )
     axes = shape if whole else (1,) * (2 - number) + axes
     return {name: value.reshape(axes + value.shape[number:]) for name, value in draws.items()}

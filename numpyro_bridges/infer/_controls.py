@@ -41,5 +41,5 @@ def warn_of_missing(name: str, missing: np.ndarray, law) -> None:
             "since the length scale is short there. Give `ControlNoise(num_points)` more of them; "
             "`ControlNoise.within(tolerance, x, kernel)`, at the shortest length scale, finds how "
             "many.",
-            stacklevel=3,
+            stacklevel=4,
         )
