@@ -41,7 +41,7 @@ for path, found in blocks[int(first) :: int(count)]:
     [
         ["extending.md"],
         ["data.md", "guides.md", "scores.md", "trees.md", "troubleshooting.md"],
-        ["hierarchical.md", "observation_sd.md", "long_runs.md"],
+        ["hierarchical.md", "loo.md", "svi.md", "observation_sd.md", "long_runs.md"],
     ],
     ids=["extending", "others", "models"],
 )
