@@ -60,7 +60,7 @@ def _with_noise(name, law, obs):
         raise ValueError(
             f"site `{site}` has no value, and there is no random key to draw one: the draws do not hold the noise that "
             f"drives `{name}`. Keep it in the run (no `~z.{site}` in `extra_fields`; `keep_noise` of "
-            "`run_checkpointed`), or integrate it out, `numpyro_bridges.estimate_evidence` of each datum's bridge."
+            "`run_checkpointed`), or integrate it out, `numpyro_bridges.log_likelihood`."
         ) from e
     plates = next(iter(own.values()))["cond_indep_stack"]
     outermost = max((-plate.dim for plate in plates), default=0)
