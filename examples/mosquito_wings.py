@@ -145,6 +145,13 @@ for name in ("amplitude", "length_scale"):
 print(f"divergences: {int(np.sum(mcmc.get_extra_fields()['diverging']))}")
 
 # %% [markdown]
+# How well is a wing predicted from the others? The log likelihoods have the noise integrated out,
+# by 16 bridges at each of 200 draws.
+
+# %%
+print(az.loo(results))
+
+# %% [markdown]
 # ## Posterior bridges
 # A draw of (α, ℓ, noise) is a draw of the path: nothing is to be simulated again.
 

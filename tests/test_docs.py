@@ -42,8 +42,9 @@ for path, found in blocks[int(first) :: int(count)]:
         ["extending.md"],
         ["data.md", "guides.md", "scores.md", "trees.md", "troubleshooting.md"],
         ["fields.md", "hierarchical.md", "observation_sd.md", "long_runs.md"],
+        ["loo.md", "svi.md"],
     ],
-    ids=["extending", "others", "models"],
+    ids=["extending", "others", "models", "integrated"],
 )
 def test_code_runs_as_it_stands(names, tmp_path):
     """Every block by itself, in single precision as a user's process has it; an error names the

@@ -70,7 +70,7 @@ def _with_noise(name, law, obs):
             f"site `{site}` has no value, and there is no random key to draw one: the draws do "
             f"not hold the noise that drives `{name}`. Keep it in the run (no `~z.{site}` in "
             "`extra_fields`; `keep_noise` of `run_checkpointed`), or integrate it out, "
-            "`numpyro_bridges.estimate_evidence` of each datum's bridge."
+            "`numpyro_bridges.log_likelihood`."
         ) from e
     plates = next(iter(own.values()))["cond_indep_stack"]
     # enumeration puts axes to the left of all plates: a law that has some depends on such a site
