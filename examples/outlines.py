@@ -12,8 +12,11 @@
 #   there is nothing to be seen in an outline;
 # - **varifolds** of outlines with uneven points of their own.
 #
-#     python examples/outlines.py            # half an hour on two cores
-#     python examples/outlines.py --quick    # two minutes, most of which is compilation
+# Chords lie inside a curve: outlines of few points differ by more than their curves do. See how the answer of the
+# varifolds moves with `--points` and `--curve-points`.
+#
+#     python examples/outlines.py
+#     python examples/outlines.py --quick    # some minutes, most of which is compilation
 
 # %%
 import argparse
@@ -183,7 +186,7 @@ posteriors = {kind: {name: mcmc.get_samples()[name] for name in NAMES} for kind,
 prior = Predictive(parameters, num_samples=2000)(jr.key(1))
 for kind, mcmc in runs.items():
     results = nb.to_arviz(mcmc, prior=prior)
-    print(kind, az.summary(results, var_names=NAMES).to_string(), sep="\n")
+    print(kind, az.summary(results, var_names=list(NAMES)).to_string(), sep="\n")
 for kind in ("landmarks", "sliding"):
     apart = []
     for name in NAMES:
