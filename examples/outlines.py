@@ -203,14 +203,14 @@ arguments.output.mkdir(parents=True, exist_ok=True)
 written = [arguments.output / name for name in ("outlines.nc", "outlines.png", "outlines_posterior.png")]
 results.to_netcdf(str(written[0]), engine="h5netcdf")
 
-figure, axes = plt.subplots(2, 2, figsize=(9, 4), sharex=True, sharey=True, constrained_layout=True)
-for ax, outline, points, corresponding in zip(axes.flat, outlines, curves, landmarks, strict=False):
+figure, axes = plt.subplots(1, 2, figsize=(10, 2.4), sharey=True, constrained_layout=True)
+for ax, outline, points, corresponding in zip(axes, outlines, curves, landmarks, strict=False):
     ax.plot(*mean[np.arange(len(mean) + 1) % len(mean)].T, color="0.8")
     ax.plot(*outline.T, color="0.4", linewidth=0.8)
     ax.plot(*corresponding.T, "o", markersize=3, fillstyle="none", label="landmarks")
     ax.plot(*points.T, ".", markersize=5, label="points of an outline")
     ax.set_aspect("equal")
-axes[0, 0].legend(fontsize="x-small")
+axes[0].legend(fontsize="x-small")
 figure.savefig(written[1], dpi=150)
 plt.close()
 
