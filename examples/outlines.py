@@ -13,8 +13,11 @@
 #   semilandmarks: along it there is nothing to be seen in an outline;
 # - **varifolds** of outlines with uneven points of their own.
 #
-#     python examples/outlines.py            # half an hour on two cores
-#     python examples/outlines.py --quick    # two minutes, most of which is compilation
+# Chords lie inside a curve: outlines of few points differ by more than their curves do. See how the
+# answer of the varifolds moves with `--points` and `--curve-points`.
+#
+#     python examples/outlines.py
+#     python examples/outlines.py --quick    # some minutes, most of which is compilation
 
 # %%
 import argparse
@@ -213,7 +216,7 @@ posteriors = {
 prior = Predictive(parameters, num_samples=2000)(jr.key(1))
 for kind, mcmc in runs.items():
     results = nb.to_arviz(mcmc, prior=prior)
-    print(kind, az.summary(results, var_names=NAMES).to_string(), sep="\n")
+    print(kind, az.summary(results, var_names=list(NAMES)).to_string(), sep="\n")
 for kind in ("landmarks", "sliding"):
     apart = []
     for name in NAMES:
@@ -232,14 +235,14 @@ written = [
 ]
 results.to_netcdf(str(written[0]), engine="h5netcdf")
 
-figure, axes = plt.subplots(2, 2, figsize=(9, 4), sharex=True, sharey=True, constrained_layout=True)
-for ax, outline, points, corresponding in zip(axes.flat, outlines, curves, landmarks, strict=False):
+figure, axes = plt.subplots(1, 2, figsize=(10, 2.4), sharey=True, constrained_layout=True)
+for ax, outline, points, corresponding in zip(axes, outlines, curves, landmarks, strict=False):
     ax.plot(*mean[np.arange(len(mean) + 1) % len(mean)].T, color="0.8")
     ax.plot(*outline.T, color="0.4", linewidth=0.8)
     ax.plot(*corresponding.T, "o", markersize=3, fillstyle="none", label="landmarks")
     ax.plot(*points.T, ".", markersize=5, label="points of an outline")
     ax.set_aspect("equal")
-axes[0, 0].legend(fontsize="x-small")
+axes[0].legend(fontsize="x-small")
 figure.savefig(written[1], dpi=150)
 plt.close()
 
