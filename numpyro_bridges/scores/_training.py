@@ -221,41 +221,12 @@ def train(
         return eqx.tree_at(where, state, new), losses
 
     def look(state: _State, loss_value, seconds) -> _State:
-        value, bound, ess, *_ = judge(eqx.combine(state.average, static))
-        higher = bool(value > state.best_value)
-        better = higher and not bool(ess < state.best_ess / 2)
-        better = better or (training.patience is None and bool(value > -jnp.inf))
-        i = -(-int(state.update) // training.interval)
-        # NumPy: each length would be another program
-        history = {k: np.array(v) for k, v in state.history.items()}
-        row = {
-            "update": float(state.update),
-            "loss": loss_value,
-            "bound": bound,
-            "ess": ess,
-            "seconds": seconds,
-        }
-        for name, number in row.items():
-            history[name][i] = number
-        return eqx.tree_at(
-            lambda s: (s.best, s.best_value, s.best_ess, s.waited, s.history),
-            state,
-            (
-                state.average if better else state.best,
-                jnp.where(better, value, state.best_value),
-                jnp.where(better, ess, state.best_ess),
-                jnp.zeros((), int) if higher else state.waited + 1,
-                {k: jnp.asarray(v) for k, v in history.items()},
-            ),
-        )
-
-    def rows(state: _State) -> dict[str, Array]:
-        kept = np.isfinite(np.asarray(state.history["update"]))
-        return {k: jnp.asarray(np.asarray(v)[kept]) for k, v in state.history.items()}
+        judged = judge(eqx.combine(state.average, static))
+        return _looked(state, judged, loss_value, seconds, training)
 
     def show(state: _State) -> None:
         if watch is not None:
-            watch(eqx.combine(state.average, static), rows(state))
+            watch(eqx.combine(state.average, static), _rows(state))
 
     label = _label(name, problem, arrays, key, training)
     if file is not None and file.exists():
@@ -286,13 +257,47 @@ def train(
             state = look(new, jnp.sum(losses) / done, spent)
             if file is not None and is_writer(mesh):
                 _save(file, state, label)
-            row = {k: float(np.asarray(v)[-1]) for k, v in rows(state).items()}
+            row = {k: float(np.asarray(v)[-1]) for k, v in _rows(state).items()}
             bar.set_postfix_str(
                 f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %"
             )
             bar.update(done)
             show(state)
-    return eqx.combine(state.best, static), rows(state)
+    return eqx.combine(state.best, static), _rows(state)
+
+
+def _looked(state: _State, judged, loss_value, seconds, training: Training) -> _State:
+    """The state with the average kept if it is better than what was kept, and a row of history."""
+    value, bound, ess, *_ = judged
+    higher = bool(value > state.best_value)
+    better = higher and not bool(ess < state.best_ess / 2)
+    # without patience the last network is wanted, if it is one
+    better = better or (training.patience is None and bool(value > -jnp.inf))
+    i = -(-int(state.update) // training.interval)
+    # NumPy: each length would be another program
+    history = {k: np.array(v) for k, v in state.history.items()}
+    history["update"][i] = float(state.update)
+    history["loss"][i] = loss_value
+    history["bound"][i] = bound
+    history["ess"][i] = ess
+    history["seconds"][i] = seconds
+    return eqx.tree_at(
+        lambda s: (s.best, s.best_value, s.best_ess, s.waited, s.history),
+        state,
+        (
+            state.average if better else state.best,
+            jnp.where(better, value, state.best_value),
+            jnp.where(better, ess, state.best_ess),
+            jnp.zeros((), int) if higher else state.waited + 1,
+            {k: jnp.asarray(v) for k, v in history.items()},
+        ),
+    )
+
+
+def _rows(state: _State) -> dict[str, Array]:
+    """The history of the looks that were made."""
+    made = np.isfinite(np.asarray(state.history["update"]))
+    return {k: jnp.asarray(np.asarray(v)[made]) for k, v in state.history.items()}
 
 
 def _stopped(state: _State, training: Training) -> bool:
