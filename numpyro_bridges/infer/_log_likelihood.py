@@ -144,11 +144,8 @@ def log_likelihood(
     }
     parts = [part for part in parts if part.needs <= set(at)]
     own = all(name in at for part in parts for name in part.fresh)
-    proposals = {
-        part.name: _fitted(part, samples, sites, replay)
-        for part in parts
-        if part.effects and set(part.effects) <= set(samples)
-    }
+    with_effects = [part for part in parts if part.effects and set(part.effects) <= set(samples)]
+    proposals = {part.name: _fitted(part, samples, sites, replay) for part in with_effects}
     chosen = (np.arange(chains)[:, None] * length + numbers[places]).ravel()
     means = {name: mean[chosen] for name, (mean, _) in proposals.items()}
 
@@ -166,7 +163,9 @@ def log_likelihood(
     # every device takes its draws one after the other: the points of one are a batch already
     run = jax.jit(spread(at_draw, batch_size=1))
     found = gather(run(at, means, jr.split(key, len(chosen)))) if parts else {}
-    values, errors, shapes = {}, {}, {}
+    values = {}
+    errors = {}
+    shapes = {}
     for name, log_weights in found.items():
         log_weights = np.moveaxis(np.asarray(log_weights), 1, -1)  # (draws, *data, K)
         mean = np.asarray(weights.log_mean_exp(jnp.asarray(log_weights)))
@@ -229,15 +228,10 @@ def _parts(sites, replay) -> list[_Part]:
             stacklevel=3,
         )
     local = _local(sites, data, users)
-    parts, remaining = [], [name for name in data if name not in in_loops]
+    parts = []
+    remaining = [name for name in data if name not in in_loops]
     while remaining:
-        together, inside = {remaining[0]}, set()
-        while True:
-            found = {source for name in together | inside for source in sources[name] & local}
-            joined = together | {user for name in found for user in users[name] if user in data}
-            if found == inside and joined == together:
-                break
-            together, inside = joined, found
+        together, inside = _together(remaining[0], data, local, sources, users)
         remaining = [name for name in remaining if name not in together]
         needs = {source for name in together | inside for source in sources[name]} - inside
         blocks = {
@@ -255,6 +249,19 @@ def _parts(sites, replay) -> list[_Part]:
             )
         )
     return parts
+
+
+def _together(first, data, local, sources, users) -> tuple[set[str], set[str]]:
+    """Data that share local sites with the first, directly or by others, and these sites."""
+    together = {first}
+    inside = set()
+    while True:
+        found = {source for name in together | inside for source in sources[name] & local}
+        joined = together | {user for name in found for user in users[name] if user in data}
+        if found == inside and joined == together:
+            return together, inside
+        together = joined
+        inside = found
 
 
 def _local(sites, data, users) -> set[str]:
@@ -339,15 +346,14 @@ def _log_weights(parts, laws, replay, values: Sites, key, is_own) -> Sites:
     key_laws, *keys = jr.split(key, 1 + len(names))
     keys = dict(zip(names, keys, strict=True))
     tips = {name for part in parts for name in part.tips}
-    drawn, from_prior = {}, {}
-    for i, part in enumerate(parts):
-        if part.name in laws:
-            key_point, key_choice = jr.split(jr.fold_in(key_laws, i))
-            point = laws[part.name].sample(key_point)
-            choice = jr.bernoulli(key_choice, _FROM_PRIOR, point.shape[:-1])
-            drawn |= dict.fromkeys(part.effects, part.name)
-            from_prior[part.name] = choice, point
-    used = dict.fromkeys(from_prior, 0)
+    drawn = {effect: part.name for part in parts if part.name in laws for effect in part.effects}
+    mixed = {}
+    for i, (name, law) in enumerate(laws.items()):
+        key_point, key_choice = jr.split(jr.fold_in(key_laws, i))
+        point = law.sample(key_point)
+        mixed[name] = jr.bernoulli(key_choice, _FROM_PRIOR, point.shape[:-1]), point
+    # how many numbers of each point the effects that the model has drawn so far have taken
+    used = dict.fromkeys(mixed, 0)
 
     def value_of(site):
         name = site["name"]
@@ -359,7 +365,7 @@ def _log_weights(parts, laws, replay, values: Sites, key, is_own) -> Sites:
             at_tip = _rows_of_tips(site["infer"]["blocks"])[:, None, None]
             return jnp.where(at_tip & ~is_own, new, values[name])
         if name in drawn:
-            choice, point = from_prior[drawn[name]]
+            choice, point = mixed[drawn[name]]
             transform = biject_to(law.support)
             shape = transform.inverse_shape(jnp.shape(new))
             start = used[drawn[name]]
