@@ -9,6 +9,7 @@ import os
 import socket
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax
@@ -96,20 +97,23 @@ def trained(mesh, folder):
     """A few updates, saved and gone on with; their paths and the held-out ones."""
     sde = nb.SDE(lambda t, x, a: jnp.sin(3 * x), lambda t, x, a: 0.5, None)
     network = nb.scores.MLP((1, 1), key=jr.key(5), width=8, depth=1)
-    found = nb.scores.fit(
-        sde,
-        MATCH.at(DATUM),
-        x0=X0,
-        t1=1.0,
-        num_steps=2,
-        key=jr.key(6),
-        guide=nb.Unguided(),
-        network=network,
-        training=nb.scores.Training(8, 8, interval=4, held_out=32, learning_rate=0.05),
-        directory=folder,
-        progress=False,
-        mesh=mesh,
-    )
+    with warnings.catch_warnings():
+        # so few updates may bring nothing, which is no matter here
+        warnings.filterwarnings("ignore", ".*brought nothing", UserWarning)
+        found = nb.scores.fit(
+            sde,
+            MATCH.at(DATUM),
+            x0=X0,
+            t1=1.0,
+            num_steps=2,
+            key=jr.key(6),
+            guide=nb.Unguided(),
+            network=network,
+            training=nb.scores.Training(8, 8, interval=4, held_out=32, learning_rate=0.05),
+            directory=folder,
+            progress=False,
+            mesh=mesh,
+        )
     return [found.history[name] for name in ("bound", "ess", "gain", "gain_error")]
 
 
