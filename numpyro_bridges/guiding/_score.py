@@ -129,7 +129,8 @@ class ScoreGuide(AbstractGuide):
 
     def check(self, sde, x):
         self.guide.check(sde, x)
-        scale, shape = self.standard.scale.shape, x.shape if x.ndim == 2 else (*x.shape, 1)
+        scale = self.standard.scale.shape
+        shape = x.shape if x.ndim == 2 else (*x.shape, 1)
         require(
             scale in ((), shape),
             f"`guide` was trained for states {scale}; got a state {x.shape}. Only landmarks may "
@@ -157,7 +158,8 @@ class ScoreGuide(AbstractGuide):
     def plan(self, sde, seen, reference, ts):
         network, context = self.programs
         base = self.guide.plan(sde, seen, reference, ts)
-        n, dtype = reference.shape[0], reference.dtype
+        n = reference.shape[0]
+        dtype = reference.dtype
         weights = jnp.ones(n, dtype) if sde.space is None else sde.space.weights.astype(dtype)
         a = diagonal(sde.covariance(ts[-1], reference), n)
         unit = weights * jnp.sqrt(jnp.sum(weights) / jnp.sum(weights * a) / self.standard.duration)

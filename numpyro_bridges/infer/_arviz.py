@@ -360,7 +360,9 @@ def _axis(name, axis, labels) -> str:
 
 def _of_nodes(found, leading, draws, coords, trees):
     """A dataset of the states of the nodes of each tree that vary."""
-    values, labels, inner = {}, {}, {}
+    values = {}
+    labels = {}
+    inner = {}
     for name, every in found.items():
         number = 2 + len(leading[name])
         before = tuple(range(number))
@@ -398,10 +400,8 @@ def _seen_only(found, seen, axes, coords, nodes):
 
     `nodes`: labels of the last axis of some.
     """
-    variables, labels = (
-        {},
-        {_axis(name, "node", nodes): own for name, own in nodes.items() if name in found},
-    )
+    variables = {}
+    labels = {_axis(name, "node", nodes): own for name, own in nodes.items() if name in found}
     for name, values in found.items():
         last = [_axis(name, "node", nodes)] if name in nodes else []
         mask = seen.get(name, np.ones((), bool))
@@ -451,7 +451,8 @@ def _labelled(found, leading, kept, coords, branches):
         agreed = len({grid[axis] for grid in grids.values() if axis in grid}) == 1
         return axis if agreed and axis not in taken else f"{name}_{axis}"
 
-    variables, labels = {}, {"draw": _numbers(coords, kept)}
+    variables = {}
+    labels = {"draw": _numbers(coords, kept)}
     for name, (path, times) in found.items():
         axes = [label(name, axis) for axis in grids[name]]
         variables[name] = (["chain", "draw", *leading[name], *axes], path)

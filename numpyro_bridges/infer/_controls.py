@@ -22,7 +22,8 @@ def has_controls(law) -> bool:
 
 def missing_variance(law) -> Array:
     """The part of a(x, x) that the controls do not tell of the worst landmark of the start."""
-    flow, x0 = law.parts["sde"], law.parts["x0"]
+    flow = law.parts["sde"]
+    x0 = law.parts["x0"]
     return flow.noise_field.error(flow.kernel, flow.covariance_kernel, flow.space.dim, x0[None])[
         "missing"
     ]

@@ -38,10 +38,8 @@ def with_noise(mcmc):
     """Indices of the draws whose noise is there, and the values of those draws."""
     samples = mcmc.get_samples(group_by_chain=True)
     draws = np.arange(next(iter(samples.values())).shape[1])
-    noise, every = (
-        mcmc.get_extra_fields(group_by_chain=True).get("noise"),
-        getattr(mcmc, "_keep_noise", None),
-    )
+    noise = mcmc.get_extra_fields(group_by_chain=True).get("noise")
+    every = getattr(mcmc, "_keep_noise", None)
     if not isinstance(noise, dict) or not every or every > len(draws):
         return draws, samples
     draws = draws[every - 1 :: every]

@@ -111,7 +111,8 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         self._max_num_steps = positive_integer(max_num_steps, "max_num_steps")
 
     def get_diagnostics_str(self, state):
-        step, steps = float(state.adapt_state.step_size), int(state.num_steps)
+        step = float(state.adapt_state.step_size)
+        steps = int(state.num_steps)
         return f"{steps} steps of size {step:.2e}. acc. prob={float(state.mean_accept_prob):.2f}"
 
     def _init_one(self, key, z, reference, model_args, model_kwargs):
@@ -120,7 +121,9 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         step = jnp.maximum(jnp.asarray(self._step_size, phi.dtype), least)
         adapt = AdaptState(*start_step_size(step), start_windows(reference))
         energy = phi + half_square(self._parts(z)[1])
-        i, zero, no = jnp.zeros((), int), jnp.zeros_like(phi), jnp.array(False)
+        i = jnp.zeros((), int)
+        zero = jnp.zeros_like(phi)
+        no = jnp.array(False)
         return FunctionSpaceHMCState(
             i, z, phi, gradient, energy, energy, i, zero, zero, no, adapt, key, UNSEALED
         )

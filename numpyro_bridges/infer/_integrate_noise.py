@@ -63,7 +63,8 @@ class _Averages(Messenger):
     def __init__(self, fn, num_particles):
         super().__init__(fn)
         self._num_particles = num_particles
-        self._hidden, self._averaged = [], []
+        self._hidden = []
+        self._averaged = []
 
     def process_message(self, msg):
         if msg["type"] != "sample":
@@ -98,7 +99,9 @@ class _Averaged(dist.Distribution):
     arg_constraints = {}
 
     def __init__(self, law, key, num_particles):
-        self._law, self._key, self._num_particles = law, key, num_particles
+        self._law = law
+        self._key = key
+        self._num_particles = num_particles
         super().__init__(law.batch_shape, law.event_shape, validate_args=False)
 
     @property

@@ -183,7 +183,8 @@ class AbstractBridgeKernel(MCMCKernel):
 
     def wrap_model(self, wrapper):
         kernel = copy.copy(self)
-        kernel._model, kernel._sample_fn = wrapper(self._model), None
+        kernel._model = wrapper(self._model)
+        kernel._sample_fn = None
         return kernel
 
     def __getstate__(self):
@@ -323,7 +324,8 @@ def _starts(values, sites, constrained: bool, num_chains: int | None) -> Sites:
     chains = () if num_chains is None else (num_chains,)
     starts = {}
     for name, value in values.items():
-        transform, shape = biject_to(sites[name]["fn"].support), jnp.shape(sites[name]["value"])
+        transform = biject_to(sites[name]["fn"].support)
+        shape = jnp.shape(sites[name]["value"])
         shape = chains + (shape if constrained else transform.inverse_shape(shape))
         x = as_float(value, f"init_params['{name}']")
         require(

@@ -133,20 +133,11 @@ def log_likelihood(
     chains, length = next(iter(samples.values())).shape[:2]
     integrated = any(part.fresh or part.tips for part in parts)
     wanted = math.ceil((draws or (_DRAWS if integrated else chains * length)) / chains)
-    numbers, driving = with_noise(mcmc)
-    if len(numbers) < min(wanted, length):
-        numbers, driving = np.arange(length), samples
-    places = spaced(len(numbers), wanted)
-    at = {
-        name: _flat(value[:, places])
-        for name, value in driving.items()
-        if is_latent(sites.get(name, _NONE))
-    }
+    numbers, at = _latent_draws(mcmc, sites, wanted)
     parts = [part for part in parts if part.needs <= set(at)]
     own = all(name in at for part in parts for name in part.fresh)
-    with_effects = [part for part in parts if part.effects and set(part.effects) <= set(samples)]
-    proposals = {part.name: _fitted(part, samples, sites, replay) for part in with_effects}
-    chosen = (np.arange(chains)[:, None] * length + numbers[places]).ravel()
+    proposals = _proposals(parts, samples, sites, replay)
+    chosen = (np.arange(chains)[:, None] * length + numbers).ravel()
     means = {name: mean[chosen] for name, (mean, _) in proposals.items()}
 
     def at_draw(values, means, key):
@@ -169,11 +160,11 @@ def log_likelihood(
     for name, log_weights in found.items():
         log_weights = np.moveaxis(np.asarray(log_weights), 1, -1)  # (draws, *data, K)
         mean = np.asarray(weights.log_mean_exp(jnp.asarray(log_weights)))
-        values[name] = mean.reshape(chains, len(places), *mean.shape[1:])
+        values[name] = mean.reshape(chains, len(numbers), *mean.shape[1:])
         errors[name], shapes[name] = _quality(log_weights, int(own))
     _warn_of_tails(shapes, num_particles * len(chosen))
     together = {part.name: part.sites for part in parts}
-    return LogLikelihood(values, errors, shapes, together, numbers[places], num_particles)
+    return LogLikelihood(values, errors, shapes, together, numbers, num_particles)
 
 
 class _Part(NamedTuple):
@@ -201,14 +192,33 @@ class _Part(NamedTuple):
 _NONE = {"type": "none"}
 
 
+def _latent_draws(mcmc, sites, wanted):
+    """Which draws of each chain, evenly spaced, and their latent sites, those of all chains one
+    after the other. With their noise, unless too few have kept theirs.
+    """
+    samples = mcmc.get_samples(group_by_chain=True)
+    length = next(iter(samples.values())).shape[1]
+    numbers, driving = with_noise(mcmc)
+    if len(numbers) < min(wanted, length):
+        numbers = np.arange(length)
+        driving = samples
+    places = spaced(len(numbers), wanted)
+    at = {
+        name: _flat(value[:, places])
+        for name, value in driving.items()
+        if is_latent(sites.get(name, _NONE))
+    }
+    return numbers[places], at
+
+
 def _flat(values):
     """Draws of all chains, one after the other."""
     return values.reshape(-1, *values.shape[2:])
 
 
-def _parts(sites, replay) -> list[_Part]:
+def _dependences(sites, replay, data):
+    """For each site the latent sites that its law or value depends on, and the reverse."""
     latent = {name: site["value"] for name, site in sites.items() if is_latent(site)}
-    data = [name for name, site in sites.items() if is_datum(site)]
 
     def log_probs(**values):
         found = replay(lambda site: values.get(site["name"]), [*data, *latent])
@@ -217,7 +227,13 @@ def _parts(sites, replay) -> list[_Part]:
     sources = eval_provenance(log_probs, **latent)
     sources = {name: set(found) - {name} for name, found in sources.items()}
     users = {name: {user for user, found in sources.items() if name in found} for name in latent}
-    noise = {name for name in latent if is_noise(sites[name])}
+    return sources, users
+
+
+def _parts(sites, replay) -> list[_Part]:
+    data = [name for name, site in sites.items() if is_datum(site)]
+    sources, users = _dependences(sites, replay, data)
+    noise = {name for name in users if is_noise(sites[name])}
     in_loops = {
         name for name in data if sites[name].get("_control_flow_done") and sources[name] & noise
     }
@@ -274,7 +290,8 @@ def _local(sites, data, users) -> set[str]:
 
     def of_one_datum(name, user):
         """A tree is none: what is left out of it is a node."""
-        one, other = sites[name], sites[user]
+        one = sites[name]
+        other = sites[user]
         alike = set(one["cond_indep_stack"]) == set(other["cond_indep_stack"])
         alike &= one["fn"].batch_shape == other["fn"].batch_shape
         whole = not isinstance(other["fn"], DiffusionTree) and not other.get("_control_flow_done")
@@ -290,6 +307,15 @@ def _local(sites, data, users) -> set[str]:
         if kept == local:
             return local
         local = kept
+
+
+def _proposals(parts, samples, sites, replay):
+    """For each part that has effects, if the run has kept them: what its draws say of them."""
+    fitted = {}
+    for part in parts:
+        if part.effects and set(part.effects) <= set(samples):
+            fitted[part.name] = _fitted(part, samples, sites, replay)
+    return fitted
 
 
 def _fitted(part: _Part, samples, sites, replay):
@@ -347,11 +373,7 @@ def _log_weights(parts, laws, replay, values: Sites, key, is_own) -> Sites:
     keys = dict(zip(names, keys, strict=True))
     tips = {name for part in parts for name in part.tips}
     drawn = {effect: part.name for part in parts if part.name in laws for effect in part.effects}
-    mixed = {}
-    for i, (name, law) in enumerate(laws.items()):
-        key_point, key_choice = jr.split(jr.fold_in(key_laws, i))
-        point = law.sample(key_point)
-        mixed[name] = jr.bernoulli(key_choice, _FROM_PRIOR, point.shape[:-1]), point
+    mixed = _mixed(laws, key_laws)
     # how many numbers of each point the effects that the model has drawn so far have taken
     used = dict.fromkeys(mixed, 0)
 
@@ -375,13 +397,25 @@ def _log_weights(parts, laws, replay, values: Sites, key, is_own) -> Sites:
         return jnp.where(is_own, values[name], new) if name in values else new
 
     found = replay(value_of, [name for part in parts for name in (*part.sites, *part.effects)])
-    log_weights = {}
-    for part in parts:
-        terms = [_log_prob(*found[name]) for name in part.sites]
-        if part.name in laws:
-            terms.append(_correction(laws[part.name], [found[name] for name in part.effects]))
-        log_weights[part.name] = sum(terms)
-    return log_weights
+    return {part.name: _log_weight(part, laws.get(part.name), found) for part in parts}
+
+
+def _log_weight(part: _Part, proposal, found):
+    """Of the data of a part, from the laws and values of its sites."""
+    total = sum(_log_prob(*found[name]) for name in part.sites)
+    if proposal is None:
+        return total
+    return total + _correction(proposal, [found[name] for name in part.effects])
+
+
+def _mixed(laws, key):
+    """Of each part: a point from its Student law, and where the prior is to be drawn from."""
+    found = {}
+    for i, (name, law) in enumerate(laws.items()):
+        key_point, key_choice = jr.split(jr.fold_in(key, i))
+        point = law.sample(key_point)
+        found[name] = jr.bernoulli(key_choice, _FROM_PRIOR, point.shape[:-1]), point
+    return found
 
 
 def _log_prob(law, value):
@@ -390,7 +424,8 @@ def _log_prob(law, value):
 
 def _correction(proposal, effects):
     """log p(u | θ) / q(u | θ) of each datum."""
-    prior, seen = 0.0, jnp.ones((), bool)
+    prior = 0.0
+    seen = jnp.ones((), bool)
     for law, value in effects:
         transform = biject_to(law.support)
         log_det = transform.log_abs_det_jacobian(transform.inv(value), value)

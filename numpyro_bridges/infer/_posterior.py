@@ -132,12 +132,14 @@ class _Split(Messenger):
 
     def __init__(self, fn, by_block):
         super().__init__(fn)
-        self.log_likelihood, self._by_block = {}, by_block
+        self.log_likelihood = {}
+        self._by_block = by_block
 
     def process_message(self, msg):
         if msg["type"] != "sample":
             return
-        fn, log_prob = msg["fn"], None
+        fn = msg["fn"]
+        log_prob = None
         if msg["is_observed"] and isinstance(fn, AbstractNoiseDriven):
             cut = self._by_block and fn.noise_blocks is not None
             log_prob = fn._log_prob_by_block(msg["value"]) if cut else fn.log_prob(msg["value"])

@@ -52,7 +52,8 @@ def score_frames(
         require_instance(
             bridge, GuidedBridge, f"bridges[{name!r}]" if name else "bridges", "a `GuidedBridge`"
         )
-    file, closed = as_file(file, "file"), flag(closed, "closed")
+    file = as_file(file, "file")
+    closed = flag(closed, "closed")
     if scale is not None:
         scale = known_number(scale, "scale", "a number from 0 on, a time", lambda value: value >= 0)
     paths = paths if isinstance(paths, Mapping) else dict.fromkeys(bridges, paths)
@@ -88,7 +89,8 @@ class _Row:
     """Points (T, q, 2) of a path, the drifts there, and the points (q, 2) of the target."""
 
     def __init__(self, bridge: GuidedBridge, path: ArrayLike, times: ArrayLike):
-        states, chosen = _states(bridge, path), _chosen(bridge, times)
+        states = _states(bridge, path)
+        chosen = _chosen(bridge, times)
         space = bridge.sde.space
         to_points = (lambda x: x) if space is None else space.to_points
         self.times = np.asarray(bridge.ts)[chosen]
@@ -144,7 +146,8 @@ def _states(bridge: GuidedBridge, path: ArrayLike) -> jax.Array:
 
 def _chosen(bridge: GuidedBridge, times: ArrayLike) -> NDArray:
     """The grid times nearest to the given ones, the end left out, as numbers."""
-    ts, times = np.asarray(bridge.ts), np.atleast_1d(known_float(times, "times"))
+    ts = np.asarray(bridge.ts)
+    times = np.atleast_1d(known_float(times, "times"))
     inside = np.all((times >= ts[0]) & (times < ts[-1]))
     if times.ndim > 1 or not times.size or not inside:
         raise ValueError(f"`times` must lie in [{ts[0]}, {ts[-1]}), before the end; got {times}.")
@@ -161,7 +164,8 @@ def _guiding_drift(bridge: GuidedBridge, path):
 
 def _canvas(num_rows: int, num_columns: int, corners: NDArray) -> tuple[Any, Any]:
     """A grid of axes without frames, all with the limits of the corners (N, 2)."""
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low = corners.min(axis=0)
+    high = corners.max(axis=0)
     margin = 0.04 * (high - low).max()
     width, height = 2.1 * np.maximum((high - low) / (high - low).max(), 0.2)
     size = (width * num_columns + 0.4, height * num_rows + 0.7)

@@ -37,11 +37,13 @@ def training(guides: ScoreGuide | Mapping[str, ScoreGuide], file: Any) -> Any:
             f"`{label}` must have a history of its training, as `nb.scores.fit` gives; got "
             f"{words(guide.history)}.",
         )
-    plt, file = pyplot(), as_file(file, "file")
+    plt = pyplot()
+    file = as_file(file, "file")
     figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.0), sharex=True, layout="constrained")
     for i, (name, guide) in enumerate(guides.items()):
         bound, ess, seconds = (np.asarray(guide.history[column], float) for column in _COLUMNS)
-        kept, color = _kept(bound, ess), _COLORS[i % len(_COLORS)]
+        kept = _kept(bound, ess)
+        color = _COLORS[i % len(_COLORS)]
         for ax, values in zip(
             axes, (np.where(np.isfinite(bound), bound, np.nan), 100 * ess), strict=True
         ):

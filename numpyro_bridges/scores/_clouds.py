@@ -116,7 +116,8 @@ def guided_cloud(bridge: GuidedBridge, key: PRNGKeyArray, size: int, least: floa
     half = -(-size // 2)
     noise = jr.normal(key, (2 * half, *bridge.noise_shape), bridge.x0.dtype)
     paths, log_weights = jax.vmap(bridge.path_and_log_weight)(noise)
-    logits, paths = _tempered(log_weights, least), jnp.moveaxis(paths, 1, 0)
+    logits = _tempered(log_weights, least)
+    paths = jnp.moveaxis(paths, 1, 0)
     halves = [slice(None, half), slice(half, None)]
     first, second = (_along(bridge, paths[:, part], logits[part], None).rho for part in halves)
     clouds = [
@@ -176,7 +177,9 @@ def forward_cloud(
 ) -> Cloud:
     """p(t, ·) of an SDE from x0; `bridge` is the reversed one, which is conditioned on x0."""
     assert isinstance(bridge.sde, ReversedSDE)
-    sde, clock, x0 = bridge.sde.sde, bridge.sde.clock, bridge.end()[1]
+    sde = bridge.sde.sde
+    clock = bridge.sde.clock
+    x0 = bridge.end()[1]
 
     def law(times, y):
         return sde.transition(clock - times[1], clock - times[0], y)
@@ -195,7 +198,8 @@ def reversed_bridge(
     bridge: GuidedBridge, end: State, guide: AbstractGuide | None = None
 ) -> GuidedBridge:
     """The reversed process from the end of a bridge, conditioned on x0, on the mirrored grid."""
-    shown, elapsed = bridge.shown_ts, bridge.grid.elapsed
+    shown = bridge.shown_ts
+    elapsed = bridge.grid.elapsed
     reverse = ReversedSDE(bridge.sde, shown[-1])
     match = ExactMatch().at(bridge.x0)
     return GuidedBridge(reverse, match, x0=end, ts=elapsed[-1] - elapsed[::-1], guide=guide)
@@ -246,7 +250,8 @@ def _cloud(
     half are effective, but for paths that are given, `(K, B, n, dim)` before the end, and keep the
     weights exp(logits).
     """
-    size, seen = y.shape[0], bridge.end()[0]
+    size = y.shape[0]
+    seen = bridge.end()[0]
     start_moves = not seen.exact
     g = jax.vmap(lambda x: _observed_score(bridge, x))(y) if start_moves else jnp.zeros_like(y)
     moves = jnp.ones(bridge.num_steps, y.dtype).at[-1].set(1.0 if start_moves else 0.0)
@@ -255,7 +260,8 @@ def _cloud(
         y, g, logits = carry
         t0, t1, key, moves, rho, given = inputs
         key_move, key_resample = jr.split(key)
-        times, keys = (t0, t1), jr.split(key_move, size)
+        times = (t0, t1)
+        keys = jr.split(key_move, size)
         new = jax.vmap(advance, (None, 0, 0, 0))(times, y, keys, given)
         within = jax.vmap(lambda y: _within(bridge, t0, t1 - t0, y, stride))(new)
         new = jnp.where(within.reshape(-1, *[1] * (y.ndim - 1)), new, y)
@@ -300,7 +306,8 @@ def _observed_score(bridge: GuidedBridge, x: State) -> State:
 
 def _coefficient(norm, weights, x, push, past) -> Float[Array, ""]:
     """The ρ from 0 to 1 that makes push + ρ past smallest."""
-    push, past = norm(x, push), norm(x, past)
+    push = norm(x, push)
+    past = norm(x, past)
     w = weights.reshape(-1, *[1] * (push.ndim - 1))
     return jnp.clip(
         -jnp.sum(w * push * past) / jnp.maximum(jnp.sum(w * past * past), 1e-30), 0.0, 1.0

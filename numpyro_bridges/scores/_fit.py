@@ -59,7 +59,9 @@ from ._training import Loss, Training, train
 _LEAST_HELD_OUT = 16  # independent differences: with fewer their standard error is itself unknown
 _STRIDE = 0.5  # of clouds, in the largest displacement of the guide's paths
 # of a cloud and of an update for one of a batch, in `matching`; problems
-_PATHS, _POINTS, _MATCHED = 4, 16, 16
+_PATHS = 4
+_POINTS = 16
+_MATCHED = 16
 
 Draw = Callable[[PRNGKeyArray], tuple[AbstractSDE, AbstractCondition, State]]
 
@@ -230,7 +232,8 @@ def _better(bridge: GuidedBridge, key: PRNGKeyArray, num_paths: int = 256) -> Gu
         return jnp.mean(log_weights), weights.effective_sample_size(log_weights)
 
     plain = bridge.with_guide(_driftless(bridge))
-    (bound, ess), (plain_bound, plain_ess) = judged(bridge), judged(plain)
+    bound, ess = judged(bridge)
+    plain_bound, plain_ess = judged(plain)
     return plain if plain_bound > bound and plain_ess > ess else bridge
 
 
@@ -285,7 +288,9 @@ def matching(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
         key_step, key_path = jr.split(key)
         k = jr.choice(key_step, bridge.num_steps, (num_points,), p=jnp.diff(bridge.grid.elapsed))
         i = jr.choice(key_path, weights.size, (num_points,), p=weights)
-        states, targets, ts = states[k, i], targets[k, i], bridge.shown_ts[k]
+        states = states[k, i]
+        targets = targets[k, i]
+        ts = bridge.shown_ts[k]
 
         def error(output):
             def one(t, x, f, target):
@@ -327,14 +332,16 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     _need_noise(bridge, "reversal")
     _need_value(bridge, "reversal")
     key_standard, key_pilots, key_judges, key_first, key_second = jr.split(key, 5)
-    (key_pilot, key_pilot_2), (key_judge, key_judge_2) = jr.split(key_pilots), jr.split(key_judges)
+    key_pilot, key_pilot_2 = jr.split(key_pilots)
+    key_judge, key_judge_2 = jr.split(key_judges)
 
     def draw_back(key, guide):
         key_draw, key_end = jr.split(key)
         bridge = problem.draw(key_draw)
         return reversed_bridge(bridge, ends(bridge, key_end, 1)[0], guide(bridge))
 
-    context, network = problem.guide.context, problem.guide.network
+    context = problem.guide.context
+    network = problem.guide.network
     start, stride = _untrained(
         network, problem.draw, context, key_standard, lambda bridge: bridge.x0
     )
@@ -430,7 +437,8 @@ def _gain(name: str, before, after) -> dict[str, Array]:
     if len(before) == 3:  # a time reversal is not a guide, and has no paths of its own
         return {}
     differences = np.asarray(after[3] - before[3], float)
-    gain, few = np.mean(differences), differences.size < _LEAST_HELD_OUT
+    gain = np.mean(differences)
+    few = differences.size < _LEAST_HELD_OUT
     error = np.nan if few else np.std(differences, ddof=1) / np.sqrt(differences.size)
     ess, ess_before = (100 * float(found[2]) for found in (after, before))
     bounds = (
@@ -569,9 +577,11 @@ def _judge(problem: Problem, key: PRNGKeyArray):
     """
     draws = 16 if problem.amortised else 1
     half = -(-problem.training.held_out // (2 * draws))
-    over_paths, over_draws = partial(problem.spread, size=2 * half), jax.vmap
+    over_paths = partial(problem.spread, size=2 * half)
+    over_draws = jax.vmap
     if problem.amortised:
-        over_paths, over_draws = jax.vmap, partial(problem.spread, size=draws)
+        over_paths = jax.vmap
+        over_draws = partial(problem.spread, size=draws)
 
     @eqx.filter_jit
     def judge(network):
@@ -586,7 +596,8 @@ def _judge(problem: Problem, key: PRNGKeyArray):
 
         pairs, ess, deviation = over_draws(one)(jr.split(key, draws))
         parts = jnp.mean(pairs, axis=1) if problem.amortised else pairs[0]
-        bound, ess = jnp.mean(parts), jnp.mean(ess)
+        bound = jnp.mean(parts)
+        ess = jnp.mean(ess)
         value = jnp.where(jnp.isfinite(bound), bound, -jnp.inf)
         perfect = jnp.all(deviation < jnp.sqrt(jnp.finfo(deviation.dtype).eps))
         value = jnp.where(perfect, jnp.inf, value)
@@ -625,13 +636,12 @@ def _untrained(
     pooled = isinstance(bridge.sde.space, Landmarks)
     away = jnp.mean((paths - v[:, None]) ** 2, axis=(0, 1))
     if pooled:
-        centre, width = (
-            jnp.zeros(()),
-            jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=1, keepdims=True)) ** 2)),
-        )
+        centre = jnp.zeros(())
+        width = jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=1, keepdims=True)) ** 2))
         away = jnp.mean(away)
     else:
-        centre, width = jnp.mean(v, axis=0), jnp.std(v, axis=0)
+        centre = jnp.mean(v, axis=0)
+        width = jnp.std(v, axis=0)
         width = jnp.where(width > 1e-6 * (1 + jnp.abs(centre)), width, 1.0)
     scale = jnp.sqrt(away)
     scale = jnp.where(scale > 1e-6 * jnp.max(scale), scale, 1.0)

@@ -44,9 +44,11 @@ class MLP(eqx.Module):
         depth: int = 3,
     ):
         require_key(key)
-        self.num_times, size = 4, _size(shape)
+        self.num_times = 4
+        size = _size(shape)
         context = positive_integer(context, "context", least=0)
-        width, depth = positive_integer(width, "width"), positive_integer(depth, "depth", least=0)
+        width = positive_integer(width, "width")
+        depth = positive_integer(depth, "depth", least=0)
         layers = eqx.nn.MLP(3 * size + context + 8 + 3, size, width, depth, jax.nn.silu, key=key)
         self.layers = eqx.tree_at(lambda m: m.layers[-1], layers, replace_fn=_zero)
 
@@ -92,8 +94,10 @@ class PointNetwork(eqx.Module):
         heads: int = 2,
     ):
         require_key(key)
-        dim, context = positive_integer(dim, "dim"), positive_integer(context, "context", least=0)
-        width, heads = positive_integer(width, "width"), positive_integer(heads, "heads")
+        dim = positive_integer(dim, "dim")
+        context = positive_integer(context, "context", least=0)
+        width = positive_integer(width, "width")
+        heads = positive_integer(heads, "heads")
         depth = positive_integer(depth, "depth", least=0)
         key_in, key_out, *keys = jr.split(key, 2 + 2 * depth)
         self.inner = eqx.nn.Linear(2 * dim + context + 10, width, key=key_in)
@@ -153,7 +157,8 @@ class Singular(eqx.Module):
         )
         gain = eqx.nn.MLP(10, "scalar", 16, 1, jax.nn.silu, key=key)
         self.gain = eqx.tree_at(lambda m: m.layers[-1], gain, replace_fn=_zero)
-        self.network, self.softness = network, softness
+        self.network = network
+        self.softness = softness
 
     def __call__(self, t, x: State2, v: State2, theta: Float[Array, " c"]) -> State2:
         length = jnp.sqrt(jnp.maximum(1 - t, 0) + self.softness)
@@ -226,7 +231,8 @@ class UNet(eqx.Module):
         half = self.embedding // 2
         angles = 100.0 * t * jnp.asarray(128.0 ** (-np.arange(half) / half), x.dtype)
         time = jnp.concatenate([jnp.sin(angles), jnp.cos(angles)]).astype(x.dtype)
-        h, kept = jax.nn.silu(self.inner(x.ravel())), []
+        h = jax.nn.silu(self.inner(x.ravel()))
+        kept = []
         for level in self.down:
             h, state = level(h, time, state)
             kept.append(h)

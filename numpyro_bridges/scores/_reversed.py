@@ -27,7 +27,9 @@ class ReversedSDE(AbstractSDE):
     space: AbstractSpace | None
 
     def __init__(self, sde: AbstractSDE, clock: Float[Array, ""]):
-        self.sde, self.clock, self.space = sde, clock, sde.space
+        self.sde = sde
+        self.clock = clock
+        self.space = sde.space
 
     def drift(self, t: RealScalar, x: State) -> State:
         t = self.clock - t

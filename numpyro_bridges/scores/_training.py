@@ -87,7 +87,8 @@ class Training(eqx.Module):
             "`optimizer` must be one of optax, such as `optax.adam(1e-3)`; got "
             f"{words(optimizer)}.",
         )
-        self.optimizer, self.average = optimizer, average
+        self.optimizer = optimizer
+        self.average = average
         self.patience = None if patience is None else positive_integer(patience, "patience")
         self.one_step = flag(one_step, "one_step")
 
@@ -160,7 +161,8 @@ def train(
     that was looked at. Seconds are of the updates, compilation apart. The file is written by the
     first process of `mesh`, over which the loss spreads its paths.
     """
-    optimizer, decay = training.optimizer, training.average
+    optimizer = training.optimizer
+    decay = training.average
     looks = -(-training.num_updates // training.interval) + 1
     empty = {k: jnp.full(looks, jnp.nan) for k in ("update", "loss", "bound", "ess", "seconds")}
     arrays, static = eqx.partition(network, eqx.is_inexact_array)
@@ -178,10 +180,8 @@ def train(
 
     @eqx.filter_jit
     def advance(state: _State) -> tuple[_State, Array]:
-        first, last = (
-            state.update,
-            jnp.minimum(state.update + training.interval, training.num_updates),
-        )
+        first = state.update
+        last = jnp.minimum(state.update + training.interval, training.num_updates)
 
         def update(prepared, i, carry):
             arrays, average, memory, losses = carry
@@ -204,7 +204,8 @@ def train(
 
         def block(carry):
             i, (arrays, average, memory, losses) = carry
-            prepared, stop = (), last
+            prepared = ()
+            stop = last
             if prepare is not None:
                 key_prepare = jr.fold_in(key, training.num_updates + i)  # no update has this number
                 prepared = (prepare(eqx.combine(average, static), key_prepare),)

@@ -33,7 +33,8 @@ _NEWTON = 8
 _FELT = 0.1
 """Variance of the jitter, relative to that of an observation, from which on there is a warning."""
 
-_SEEN, _REFUSED = 0.01, 0.1
+_SEEN = 0.01
+_REFUSED = 0.1
 """Wrong parts of a(x, x) from which on there is a warning, and an error."""
 
 
@@ -280,8 +281,10 @@ class KunitaFlow(AbstractSDE):
         """The points of the path's shapes, the points to be carried, and the field that moves a
         shape like this.
         """
-        path, points = as_float(path, "path"), as_float(points, "points")
-        n, dim = self.space.size, self.space.dim
+        path = as_float(path, "path")
+        points = as_float(points, "points")
+        n = self.space.size
+        dim = self.space.dim
         require(
             path.ndim == 3 and path.shape[1:] == (n, dim) and len(path) > 1,
             f"`path` must have shape (K + 1, {n}, {dim}); got {path.shape}. Use vmap for a batch.",
@@ -313,7 +316,8 @@ class KunitaFlow(AbstractSDE):
             f"`x0`, a state of this `space`, must have shape {shape}; got {x.shape}.",
         )
         at_any_time(self.noise, x)
-        index, value = self.noise_field.factored_at(x), concrete(x)
+        index = self.noise_field.factored_at(x)
+        value = concrete(x)
         index = None if index is None else concrete(index)
         if value is not None and index is not None and len(index) > 1:
             gap = _distances(np, value[index])

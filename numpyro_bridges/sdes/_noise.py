@@ -478,7 +478,8 @@ class GridNoise(AbstractNoise):
     fixed_in_space = True
 
     def __init__(self, lower=-3.0, upper=3.0, num_cells: int = 24):
-        self.lower, self.upper = as_float(lower, "lower"), as_float(upper, "upper")
+        self.lower = as_float(lower, "lower")
+        self.upper = as_float(upper, "upper")
         require_finite(self.lower, "lower")
         require_finite(self.upper, "upper")
         shapes = {self.lower.shape, self.upper.shape} - {()}
