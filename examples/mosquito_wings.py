@@ -208,7 +208,7 @@ nb.plot.bridge_fan(
     direction="column",
     closed=not arguments.open,
 )
-save("bridges.png", "posterior bridges, deviations × 4")
+save("bridges.png", "bridges from the mean (dark) to the shape seen (orange), deviations × 4")
 
 nb.plot.posterior({k: posterior[k] for k in ("amplitude", "length_scale")}, prior)
 save("posterior.png", "posterior, and prior (dashed)")

@@ -87,8 +87,9 @@ class GuidedBridge(eqx.Module):
     - `num_steps`, or `ts`: the number of steps of the default grid, or an increasing grid
       `(K + 1,)` from t0 to t1. The default is uniform, and graded towards t1, t = s(2 − s/T), where
       the end state is pinned. A grid whose steps vanish in the precision used is refused.
-    - `guide`: by default `FrozenGuide()` where a is constant, `GeodesicGuide()` for a Kunita flow,
-      `RecedingGuide()` where a depends on the state otherwise, both with `rounds=2` for a
+    - `guide`: by default `FrozenGuide()` where a is constant, `GeodesicGuide()` for a Kunita flow
+      and for other states of more than 64 numbers, whose drift is not linearised, `RecedingGuide()`
+      where a depends on the state otherwise. The first and the last have `rounds=2` for a
       `SemilinearSDE`.
     - `solver`: by default the guided step with its exact discrete weight. An Itô diffrax solver
       steps the guided drift instead, with the continuous-time weight: consistent as dt → 0, biased
