@@ -144,8 +144,8 @@ def _solver(covariance: Structured | LowRank) -> Callable[[State], State]:
 
 
 def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:
-    """`FrozenGuide()` where a is constant, `RecedingGuide()` where the linearised drift is a matrix,
-    `GeodesicGuide()` for a flow and for other states too large for a matrix.
+    """`FrozenGuide()` where a is constant, `RecedingGuide()` where the linearised drift is a
+    matrix, `GeodesicGuide()` for a flow and for other states too large for one.
 
     With a drift, geodesics are no better than the linearised drift; with a strong one they are
     worse. A semilinear equation is linearised along a path, in two rounds.
