@@ -22,11 +22,7 @@ def has_controls(law) -> bool:
 
 def missing_variance(law) -> Array:
     """The part of a(x, x) that the controls do not tell of the worst landmark of the start."""
-    flow = law.parts["sde"]
-    x0 = law.parts["x0"]
-    return flow.noise_field.error(flow.kernel, flow.covariance_kernel, flow.space.dim, x0[None])[
-        "missing"
-    ]
+    return law.parts["sde"].noise_error(law.parts["x0"])["missing"]
 
 
 def warn_of_missing(name: str, missing: np.ndarray, law) -> None:

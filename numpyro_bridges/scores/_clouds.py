@@ -149,14 +149,11 @@ def _along(bridge: GuidedBridge, paths: Array, logits: Float[Array, " B"], rho) 
     def log_pair(times, y, new):
         return log_density(bridge.sde.transition(times[0], times[1], new), y)
 
-    def no_weight(times, y):
-        return jnp.zeros((), y.dtype)
-
     def given(times, y, key, given):
         return given
 
     key = jr.key(0)  # nothing is drawn
-    return _cloud(bridge, key, paths[-1], given, log_pair, no_weight, rho, paths[:-1], logits)
+    return _cloud(bridge, key, paths[-1], given, log_pair, _no_weight, rho, paths[:-1], logits)
 
 
 def ends(bridge: GuidedBridge, key: PRNGKeyArray, size: int) -> Array:
@@ -187,11 +184,8 @@ def forward_cloud(
     def log_pair(times, y, new):
         return log_density(law(times, y), new)
 
-    def no_weight(times, y):
-        return jnp.zeros((), y.dtype)
-
     start = jnp.broadcast_to(x0, (size, *x0.shape))
-    return _cloud(bridge, key, start, _drawn(law), log_pair, no_weight, rho, stride=stride)
+    return _cloud(bridge, key, start, _drawn(law), log_pair, _no_weight, rho, stride=stride)
 
 
 def reversed_bridge(
@@ -219,6 +213,10 @@ def _drawn(law: Callable) -> Callable:
         )
 
     return advance
+
+
+def _no_weight(times, y):
+    return jnp.zeros((), y.dtype)
 
 
 def _noise_shape(transition: Transition, y: State):
