@@ -402,7 +402,7 @@ def _log_weights(parts, laws, replay, values: Sites, key, is_own) -> Sites:
 
 def _log_weight(part: _Part, proposal, found):
     """Of the data of a part, from the laws and values of its sites."""
-    total = sum(_log_prob(*found[name]) for name in part.sites)
+    total = sum((_log_prob(*found[name]) for name in part.sites), start=jnp.zeros(()))
     if proposal is None:
         return total
     return total + _correction(proposal, [found[name] for name in part.effects])
