@@ -242,6 +242,23 @@ def test_comparing_models(tmp_path):
 
 
 @pytest.mark.slow
+def test_hierarchical(tmp_path):
+    """Its own referee agrees with it: the elpd by sums over a grid of the parameters."""
+    pytest.importorskip("matplotlib")
+    script = str(ROOT / "examples/hierarchical.py")
+    out = run(script, "--quick", "--output", "output", cwd=tmp_path)
+    integrated, exact = (
+        float(re.search(pattern, out).group(1))
+        for pattern in (r"elpd of new cells: (\S+)", r"elpd by quadrature: (\S+)")
+    )
+    assert abs(integrated - exact) < 1 and "r_hat" in out
+    # of those who know the noise, and of a model of cells that are alike
+    assert float(re.search(r"given noise and current.*: (\S+)", out).group(1)) > integrated + 2
+    assert out.index("each its own ") < out.index("all alike ")
+    require_written(tmp_path, "hierarchical.nc", "hierarchical.png")
+
+
+@pytest.mark.slow
 def test_mosquito_tree(tmp_path):
     pytest.importorskip("ktch")
     pytest.importorskip("matplotlib")

@@ -89,6 +89,8 @@ def test_bridge_fan(shapes, paths, direction, axis):
     ends = [(outlines[..., axis].min(), outlines[..., axis].max()) for outlines in drawn]
     ends = ends if direction == "row" else [(-high, -low) for low, high in ends]
     assert ends[0][1] < ends[1][0] and ends[1][1] < ends[2][0]  # frames do not overlap
+    (legend,) = frames[0].figure.legends
+    assert {text.get_text() for text in legend.get_texts()} == {"start", "bridges", "target"}
 
 
 def test_score_field(shapes):

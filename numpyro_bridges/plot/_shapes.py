@@ -100,7 +100,9 @@ def bridge_fan(
     outlines.
 
     Every frame repeats the start (dark, bold in the first frame) and the target (orange, bold in
-    the last), so that the eye sees the fan leave one, widen and close on the other.
+    the last), so that the eye sees the fan leave one, widen and close on the other. They are
+    labelled "start" and "target" and the first fan "bridges", for `ax.legend()`; axes that are made
+    here have a legend.
 
     **Arguments:**
 
@@ -131,6 +133,7 @@ def bridge_fan(
     high = corners.max(axis=0)
     step = (high - low) * ([1.12, 0.0] if direction == "row" else [0.0, -1.25])
     strip = np.stack([low, high]) + step * np.arange(num_frames)[:, None, None]
+    own_axes = ax is None
     ax = shape_axes(ax, strip, size=(2.2 if direction == "row" else 1.6) * num_frames)
 
     colors = time_map()(np.linspace(0.0, 1.0, num_frames))
@@ -141,15 +144,23 @@ def bridge_fan(
         first = frame == 0
         last = frame == num_frames - 1
         drawn.append(draw(ax, paths[:, index] + shift, closed, **fan))
-        width = 2.2 if first else 0.9
-        draw(ax, (start + shift)[None], closed, colors=START, linewidths=width, zorder=3)
-        width = 2.2 if last else 0.9
-        dashed = {"linestyles": "-" if last else (0, (4, 2)), "zorder": 4}
-        draw(ax, (target + shift)[None], closed, colors=TARGET, linewidths=width, **dashed)
+        bold = {"linewidths": 2.2 if first else 0.9, "zorder": 3}
+        starts = draw(ax, (start + shift)[None], closed, colors=START, **bold)
+        bold = {"linewidths": 2.2 if last else 0.9, "zorder": 4}
+        dashes = "-" if last else (0, (4, 2))
+        targets = draw(ax, (target + shift)[None], closed, colors=TARGET, linestyles=dashes, **bold)
+        if first:
+            starts.set_label("start")
+            drawn[0].set_label("bridges")
+        if last:
+            targets.set_label("target")
         below = ((low[0] + high[0]) / 2.0 + shift[0], low[1] + shift[1])
         label = f"$t = {times[index]:.2g}$"
         style: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 9}
         ax.annotate(label, below, (0, -5), textcoords="offset points", **style)
+    if own_axes:
+        columns = 3 if direction == "row" else 1
+        ax.figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     return drawn
 
 
