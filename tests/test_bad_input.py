@@ -99,7 +99,7 @@ TRAINED = nb.ScoreGuide(
     nb.FrozenGuide(),
     NETWORK,
     STANDARD,
-    history={k: jnp.ones(2) for k in ("update", "loss", "bound", "ess", "seconds")},
+    history={k: jnp.ones(2) for k in ("update", "loss", "bound", "ess", "seconds", "kept")},
 )
 ESTIMATE = nb.EvidenceEstimate(ONE, ONE, ONE, 0.1, 0.1, jnp.zeros(4))
 SPECIMEN = io.Specimen(SQUARE, id="a")

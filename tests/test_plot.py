@@ -453,14 +453,13 @@ def test_deformation_refuses(shapes):
 
 
 def test_training(tmp_path):
-    """The network that was kept: of the best bound, but for one of less than half the ESS; what
-    follows is pale.
-    """
+    """The network that was kept has a dot; what follows is pale."""
     columns = {
         "seconds": np.arange(6.0),
         "bound": np.array([-np.inf, -3.0, -2.0, -1.0, -1.5, -0.5]),
     }
     columns["ess"] = np.array([0.1, 0.2, 0.5, 0.6, 0.6, 0.2])
+    columns["kept"] = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 0.0])
     guide = nb.ScoreGuide(nb.FrozenGuide(), abs, standard(), history=columns)
     figure = plot.training({"a": guide, "b": guide}, tmp_path / "training.png")
     assert (tmp_path / "training.png").stat().st_size > 0 and not plt.get_fignums()

@@ -655,8 +655,10 @@ def test_the_best_network_is_kept():
     training = nb.scores.Training(100, interval=5, patience=3)
     network, history = trained(training, judge=worse)
     assert np.array_equal(network, [0.0, 0.0]) and history["update"][-1] == 15
+    np.testing.assert_array_equal(history["kept"], [1, 0, 0, 0])
     last, history = trained(nb.scores.Training(30, interval=5, patience=None), judge=worse)
     assert np.all(last != 0) and history["update"][-1] == 30
+    assert np.all(history["kept"] == 1)
 
 
 def test_a_network_of_half_the_ess_is_not_kept():

@@ -93,8 +93,8 @@ class ScoreGuide(AbstractGuide):
     - `context`: `context(sde)`, the parameters that the network sees, `(c,)`; `None` if it was
       trained for one SDE.
     - `history`: of the training: `update`, `loss`, `bound` (E log w held out), `ess` (of it, a
-      fraction), `seconds`; at the end `gain` and `gain_error`, of the bound over that of the guide
-      alone, see `scores.fit`.
+      fraction), `seconds`, `kept` (1 where the network was better than those before); at the end
+      `gain` and `gain_error`, of the bound over that of the guide alone, see `scores.fit`.
     - `held`: a copy of the network with its gradient stopped, in training: the gradient of log w by
       the network is then by the path alone (Roeder, Wu and Duvenaud 2017), which has no noise where
       the guide is perfect.

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import numpyro
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 from numpyro.distributions import biject_to
@@ -45,6 +46,9 @@ PROPORTION = "in (0, 1)", lambda x: 0 < x < 1
 PROPORTION_OR_0 = "in [0, 1)", lambda x: 0 <= x < 1
 
 UNSEALED: Any = np.uint32(0)  # of a state that is being made
+
+_QUICKLY_COMPILED = {"xla_backend_optimization_level": 1}
+"""Half the time of compiling, for a program that runs once and hardly more slowly."""
 
 
 class AbstractBridgeKernel(MCMCKernel):
@@ -141,7 +145,8 @@ class AbstractBridgeKernel(MCMCKernel):
             )
 
         self._sample_fn = sample
-        state = jax.jit(start)(rng_key, init_params)
+        options = _QUICKLY_COMPILED if _runs_here_now(rng_key, init_params) else None
+        state = jax.jit(start, compiler_options=options)(rng_key, init_params)
         self._check_start(state, num_chains, model_args, model_kwargs)
         return state
 
@@ -296,6 +301,15 @@ class AbstractBridgeKernel(MCMCKernel):
         n = jnp.where(self._warming(state), state.i, state.i - self._num_warmup) + 1
         mean = jnp.where(n == 1, 0.0, state.mean_accept_prob)
         return mean + (rate - mean) / n
+
+
+def _runs_here_now(*arguments) -> bool:
+    """Whether options of the CPU's compiler may be given: within another program JAX refuses them,
+    and they are not to undo what `jax_disable_most_optimizations` asks for.
+    """
+    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(arguments))
+    optimized = not jax.config.read("jax_disable_most_optimizations")
+    return jax.default_backend() == "cpu" and optimized and not traced
 
 
 def _seal_of(model_args, model_kwargs):

@@ -4,14 +4,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .._checks import require, require_instance, words
 from ..guiding import ScoreGuide
 from ._canvas import ACCENT, NEUTRAL, START, TARGET, as_file, pyplot
 
 _COLORS = (START, TARGET, ACCENT, NEUTRAL)
-_COLUMNS = ("bound", "ess", "seconds")
+_COLUMNS = ("bound", "ess", "seconds", "kept")
 
 
 def training(guides: ScoreGuide | Mapping[str, ScoreGuide], file: Any) -> Any:
@@ -41,8 +40,11 @@ def training(guides: ScoreGuide | Mapping[str, ScoreGuide], file: Any) -> Any:
     file = as_file(file, "file")
     figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.0), sharex=True, layout="constrained")
     for i, (name, guide) in enumerate(guides.items()):
-        bound, ess, seconds = (np.asarray(guide.history[column], float) for column in _COLUMNS)
-        kept = _kept(bound, ess)
+        bound, ess, seconds, was_kept = (
+            np.asarray(guide.history[column], float) for column in _COLUMNS
+        )
+        # each was better than those before
+        kept = int(np.flatnonzero(was_kept)[-1]) if was_kept.any() else 0
         color = _COLORS[i % len(_COLORS)]
         for ax, values in zip(
             axes, (np.where(np.isfinite(bound), bound, np.nan), 100 * ess), strict=True
@@ -60,15 +62,3 @@ def training(guides: ScoreGuide | Mapping[str, ScoreGuide], file: Any) -> Any:
     figure.savefig(file, dpi=150)
     plt.close(figure)
     return figure
-
-
-def _kept(bound: NDArray, ess: NDArray) -> int:
-    """The look at which the network was kept: of the best bound, but for one of less than half the
-    ESS.
-    """
-    kept = 0
-    for i in range(1, len(bound)):
-        better = bound[i] > bound[kept] or (np.isfinite(bound[i]) and not np.isfinite(bound[kept]))
-        if better and not ess[i] < ess[kept] / 2:
-            kept = i
-    return kept

@@ -164,7 +164,8 @@ def train(
     optimizer = training.optimizer
     decay = training.average
     looks = -(-training.num_updates // training.interval) + 1
-    empty = {k: jnp.full(looks, jnp.nan) for k in ("update", "loss", "bound", "ess", "seconds")}
+    columns = ("update", "loss", "bound", "ess", "seconds", "kept")
+    empty = {column: jnp.full(looks, jnp.nan) for column in columns}
     arrays, static = eqx.partition(network, eqx.is_inexact_array)
     state = _State(
         arrays,
@@ -282,6 +283,7 @@ def _looked(state: _State, judged, loss_value, seconds, training: Training) -> _
     history["bound"][i] = bound
     history["ess"][i] = ess
     history["seconds"][i] = seconds
+    history["kept"][i] = better
     return eqx.tree_at(
         lambda s: (s.best, s.best_value, s.best_ess, s.waited, s.history),
         state,
