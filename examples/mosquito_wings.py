@@ -24,6 +24,8 @@ from pathlib import Path
 
 # threads of its own slow small matrices down, many times over
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# half the time of compiling, which is much of so short a run
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
 
 import jax
 import jax.numpy as jnp
