@@ -238,10 +238,10 @@ for name, cells in {"the same cells": same, "new cells": new}.items():
 # %% [markdown]
 # ## What is left behind: a NetCDF file and a figure
 # Most cells have stayed at rest and three have fired: what the current of a cell was is known up to
-# which of the two it favours, and currents are drawn together by their common mean.
+# which of the two it favours, and currents are drawn together by their common mean. Intervals hold
+# 50 and 90 %.
 #
-# ![Left, ends of ten cells over those that the model predicts of new ones. Right, the current of
-# each cell, with 50 and 90 % intervals, and their mean](hierarchical.png)
+# ![Ends of ten cells over those predicted of new ones; the current of each](hierarchical.png)
 
 # %%
 arguments.output.mkdir(parents=True, exist_ok=True)
