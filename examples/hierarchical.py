@@ -1,13 +1,13 @@
 # %% [markdown]
 # # Ten cells: what they share, and what each has of its own
 #
-# A nerve cell that a constant current drives follows the FitzHugh–Nagumo equations, of a voltage v
-# and of a recovery w that noise moves:
+# A nerve cell follows the FitzHugh–Nagumo equations, of a voltage v and of a recovery w, which a
+# constant input and noise move:
 #
 #     dv = (v − w − v³) / 0.3 dt,   dw = (1.5 v − w + β) dt + σ dB
 #
-# Ten cells are each seen once, after one unit of time. The noise σ is that of all; the current β
-# is each cell's own and varies about a mean μ with a spread τ. What do ten pairs of numbers say of
+# Ten cells are each seen once, after one unit of time. The noise σ is that of all; the input β
+# is each cell's own, and varies about a mean μ with a spread τ. What do ten pairs of numbers say of
 # μ, τ and σ, how well is one cell predicted from the nine others, and are they different at all?
 #
 #     python examples/hierarchical.py            # three minutes
@@ -135,9 +135,9 @@ draws = mcmc.get_samples()
 # %% [markdown]
 # ## How well is a cell predicted from the others?
 # Leave-one-out needs the probability of a cell's end given what all share. Its noise and its own
-# current are integrated out, by new bridges: `nb.log_likelihood` does it, and says how well.
+# input are integrated out, by new bridges: `nb.log_likelihood` does it, and says how well.
 #
-# Given its noise and its current, each cell would look well predicted, since both have been fitted
+# Given its noise and its input, each cell would look well predicted, since both have been fitted
 # to it: that is the second line, and no answer to the question.
 
 # %%
@@ -156,7 +156,7 @@ def leave_one_out(log_likelihood):
 
 
 def given_noise(sites):
-    """The log likelihood of each cell given its noise and its current, at one draw."""
+    """The log likelihood of each cell given its noise and its input, at one draw."""
     mu, tau, sigma = [sites[name] for name in PRIORS]
     cells = jax.vmap(cell, in_axes=(0, None))(mu + tau * sites["deviation"], sigma)
     law = nb.DiffusionEndpoint(cells, START, seen, batch_shape=(10,), batched=("sde",), **steps)
@@ -165,14 +165,14 @@ def given_noise(sites):
 
 conditional = np.asarray(jax.jit(jax.vmap(given_noise))(draws))
 print(f"\nelpd of new cells: {leave_one_out(found['each its own'].values['end']):.2f}")
-print(f"given noise and current, which nobody knows beforehand: {leave_one_out(conditional):.2f}")
+print(f"given noise and input, which nobody knows beforehand: {leave_one_out(conditional):.2f}")
 print(found["each its own"])
 
 
 # %% [markdown]
 # ## The referee
 # Three parameters are few enough for a grid. The probability of each cell's end by 200 bridges at
-# each of 48 currents and 24 values of σ; its average over the currents, given μ and τ; and the
+# each of 48 inputs and 24 values of σ; its average over the inputs, given μ and τ; and the
 # posterior without each cell, as a sum.
 
 
@@ -192,7 +192,7 @@ def elpd_on_a_grid(num_bridges=200):
     at_points = jax.jit(lambda *points: jax.lax.map(lambda point: log_density(*point), points))
     log_densities = np.asarray(at_points(*grid, keys)).reshape(48, 24, 10)
 
-    # between currents the logarithm is smooth
+    # between inputs the logarithm is smooth
     fine = np.linspace(betas[0], betas[-1], 951)
     densities = np.exp(CubicSpline(betas, log_densities)(fine)).reshape(951, -1)
     mus, taus = np.meshgrid(np.linspace(-0.7, 2.3, 61), np.linspace(0.02, 2.0, 50))
@@ -237,11 +237,11 @@ for name, cells in {"the same cells": same, "new cells": new}.items():
 
 # %% [markdown]
 # ## What is left behind: a NetCDF file and a figure
-# Most cells have stayed at rest and three have fired: what the current of a cell was is known up to
-# which of the two it favours, and currents are drawn together by their common mean. Intervals hold
+# Most cells have stayed at rest and three have fired: what the input of a cell was is known up to
+# which of the two it favours, and inputs are drawn together by their common mean. Intervals hold
 # 50 and 90 %.
 #
-# ![Ends of ten cells over those predicted of new ones; the current of each](hierarchical.png)
+# ![Ends of ten cells over those predicted of new ones; the input of each](hierarchical.png)
 
 # %%
 arguments.output.mkdir(parents=True, exist_ok=True)
@@ -264,8 +264,8 @@ for level, width in ((0.9, 1.2), (0.5, 3.5)):
 right.plot(np.median(draws["beta"][:, order], axis=0), places, "o", color="white", markersize=3)
 right.axvline(np.mean(draws["mu"]), color="0.5", linestyle="--", label="mean of μ")
 right.set_yticks(places, labels=[f"cell {i + 1}, v = {observed[i, 0]:.2f}" for i in order])
-right.set(xlabel="current β")
-right.legend(frameon=False, loc="lower right", fontsize="small")
+right.set(xlabel="input β")
+right.legend(frameon=False, loc="upper right", fontsize="small")
 picture = arguments.output / "hierarchical.png"
 figure.savefig(picture, dpi=150)
 plt.close(figure)

@@ -253,7 +253,7 @@ def test_hierarchical(tmp_path):
     )
     assert abs(integrated - exact) < 1 and "r_hat" in out
     # of those who know the noise, and of a model of cells that are alike
-    assert float(re.search(r"given noise and current.*: (\S+)", out).group(1)) > integrated + 2
+    assert float(re.search(r"given noise and input.*: (\S+)", out).group(1)) > integrated + 2
     assert out.index("each its own ") < out.index("all alike ")
     require_written(tmp_path, "hierarchical.nc", "hierarchical.png")
 
