@@ -65,6 +65,7 @@ class Case(NamedTuple):
     methods: tuple[str, ...] = ALL
     base: Any = None
     batch_size: int = 64
+    width: int | None = None  # of an MLP in place of the default network
 
 
 # Referees.
@@ -297,7 +298,8 @@ def kunita_hard(quick) -> Iterator[tuple[str, Case]]:
         bridge = nb.GuidedBridge(flow, match, x0=data["root"], t1=1.0, num_steps=100)
         yield (
             f"kunita-hard-{i}",
-            Case(bridge, lambda known=known: Truth(known), ("residual", "matching"), None, 16),
+            # of a single bridge: each of 16 landmarks sees all others with an MLP
+            Case(bridge, lambda known=known: Truth(known), ("residual", "matching"), None, 16, 128),
         )
 
 
@@ -316,12 +318,12 @@ PROBLEMS = {
 # What is measured.
 
 
-def small(bridge, width):
+def network_of(bridge, width):
     """The default network, `None`, or an MLP of this width."""
-    if width is None or isinstance(bridge.sde.space, nb.Landmarks):
+    if width is None:
         return None
     shape = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
-    return nb.scores.MLP(shape, key=jr.key(11), width=width, depth=2)
+    return nb.scores.MLP(shape, key=jr.key(11), width=width)
 
 
 def trained(case: Case, method: str, arguments) -> tuple[Any, dict[str, Any]]:
@@ -338,7 +340,7 @@ def trained(case: Case, method: str, arguments) -> tuple[Any, dict[str, Any]]:
             guide=case.base,
             key=jr.key(arguments.seed),
             method=method,
-            network=small(case.bridge, arguments.width),
+            network=network_of(case.bridge, arguments.width or case.width),
             training=training,
             progress=False,
         )
@@ -462,7 +464,7 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=60.0, help="of training, for each method")
     parser.add_argument("--rate", type=float, default=5e-3, help="the largest learning rate")
     parser.add_argument(
-        "--width", type=int, help="of an MLP of two hidden layers, in place of the default network"
+        "--width", type=int, help="of an MLP of three hidden layers, in place of what a problem has"
     )
     parser.add_argument("--particles", type=int, default=4096)
     parser.add_argument("--seed", type=int, default=0)
