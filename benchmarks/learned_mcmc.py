@@ -7,6 +7,7 @@ Six particles in a double well, dX = −4 h X (X² − 1) dt + σ dW from 1, see
 unit of time: half of them have crossed. h and σ are unknown, and the plain guides have an ESS of a
 few percent. One JSON line for each kernel and guide:
 
+- `particles` that a pseudo-marginal kernel has chosen for each datum.
 - `mean`, `sd` of log h and log σ; `errors_off`, by how many Monte Carlo errors their means differ
   from the referee's, and `sd_ratio`, their SDs relative to the referee's: a grid of 41 × 41
   parameters, the density of the same Euler chain by quadrature at each.
@@ -38,6 +39,7 @@ from scipy.special import logsumexp
 import numpyro_bridges as nb
 
 PRIORS = {"log_h": dist.Normal(np.log(3.0), 0.3), "log_sigma": dist.Normal(0.0, 0.2)}
+KERNELS = "FunctionSpaceHMC", "CorrelatedPseudoMarginalMALA"
 DATA = np.array([[-1.1], [-0.97], [-0.85], [0.88], [1.0], [1.12]])
 SD, NUM_STEPS = 0.1, 100
 SEEN, START = nb.InexactMatch(SD**2), np.ones(1)
@@ -136,7 +138,7 @@ def guide_ess(guide, parameters, key):
 
 
 def run(make_kernel, guide, num_warmup, num_samples, key):
-    """Draws `(chains, draws)` by name, and their seconds."""
+    """Draws `(parameters, chains, draws)`, their seconds, and how many particles."""
     kernel = make_kernel(partial(model, guide))
     mcmc = MCMC(
         kernel,
@@ -157,12 +159,14 @@ def run(make_kernel, guide, num_warmup, num_samples, key):
     jax.block_until_ready(more(state))
     seconds = (time.perf_counter() - start) / 50 * num_samples
     draws = mcmc.get_samples(group_by_chain=True)
-    return np.stack([np.asarray(draws[name]) for name in PRIORS]), seconds
+    particles = getattr(kernel, "num_particles", None)
+    return np.stack([np.asarray(draws[name]) for name in PRIORS]), seconds, particles
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--kernels", nargs="+", choices=KERNELS, default=list(KERNELS))
     parser.add_argument("--updates", type=int, default=5000)
     parser.add_argument("--warmup", type=int, default=300)
     parser.add_argument("--samples", type=int, default=1500)
@@ -176,23 +180,24 @@ def main():
     trained = learned(arguments.updates, key_train)
     training = float(trained.history["seconds"][-1])
     guides = {"at the end": nb.FrozenGuide(), "brownian": plain_guide(), "learned": trained}
-    kernels = {
-        "FunctionSpaceHMC": nb.infer.FunctionSpaceHMC,
-        "CorrelatedPseudoMarginalMALA": nb.infer.CorrelatedPseudoMarginalMALA,
-    }
-    for name, kernel in kernels.items():
+    for name in arguments.kernels:
+        kernel = getattr(nb.infer, name)
         best = 0.0
         for label, guide in guides.items():
-            draws, seconds = run(kernel, guide, arguments.warmup, arguments.samples, key_run)
+            draws, seconds, particles = run(
+                kernel, guide, arguments.warmup, arguments.samples, key_run
+            )
             effective = np.array([float(effective_sample_size(values)) for values in draws])
             error = sds / np.sqrt(effective)
             rate = float(effective.min()) / seconds
             row = {
                 "kernel": name,
                 "guide": label,
+                "particles": particles,
                 "guide_ess_percent": guide_ess(guide, means, key_ess),
                 "mean": draws.mean((1, 2)).tolist(),
                 "errors_off": ((draws.mean((1, 2)) - means) / error).tolist(),
+                "sd": draws.std((1, 2)).tolist(),
                 "sd_ratio": (draws.std((1, 2)) / sds).tolist(),
                 "ess": float(effective.min()),
                 "seconds": seconds,
