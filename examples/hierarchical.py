@@ -46,7 +46,7 @@ parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--output", type=Path, default=Path("output"))
 arguments = parser.parse_known_args()[0]
 quick = arguments.quick
-num_warmup, num_samples = (50, 50) if quick else (200, 400)
+num_warmup, num_samples = (50, 50) if quick else (500, 2000)
 num_particles = 16 if quick else 64
 START, ERROR_SD = np.array([-0.5, -0.6]), 0.1
 key_run, key_same, key_new, key_grid = jr.split(jr.key(arguments.seed), 4)
@@ -249,7 +249,8 @@ file = arguments.output / "hierarchical.nc"
 results["each its own"].to_netcdf(str(file), engine="h5netcdf")
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3.6), constrained_layout=True)
-cloud = np.asarray(new).reshape(-1, 2)[::5]
+cloud = np.asarray(new).reshape(-1, 2)
+cloud = cloud[:: -(-len(cloud) // 1500)]
 left.plot(*cloud.T, ".", color="0.75", markersize=2, label="new cells, by the model")
 left.plot(*observed.T, "o", color="tab:blue", markersize=5, label="what was seen")
 left.set(xlabel="voltage v at the end", ylabel="recovery w at the end")
