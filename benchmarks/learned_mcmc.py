@@ -21,7 +21,6 @@ few percent. One JSON line for each kernel and guide:
 import argparse
 import json
 import os
-import time
 from functools import partial
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -32,9 +31,11 @@ import jax.random as jr
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from mcmc import seconds_of_a_draw
 from numpyro.diagnostics import effective_sample_size
 from numpyro.infer import MCMC
 from scipy.special import logsumexp
+from scipy.stats import norm
 
 import numpyro_bridges as nb
 
@@ -72,12 +73,11 @@ def referee(num=41):
     def log_likelihood(log_h, log_sigma):
         scale = np.exp(log_sigma) * np.sqrt(dt)
         ahead = x - dt * 4 * np.exp(log_h) * x * (x * x - 1)
-        step = np.exp(-0.5 * ((x[:, None] - ahead) / scale) ** 2) / (scale * np.sqrt(2 * np.pi))
-        density = np.exp(-0.5 * ((x - 1.0) / scale) ** 2) / (scale * np.sqrt(2 * np.pi))
+        step = norm.pdf(x[:, None], ahead, scale)
+        density = norm.pdf(x, START, scale)
         for _ in range(NUM_STEPS - 1):
             density = spacing * step @ density
-        seen = np.exp(-0.5 * ((DATA - x) / SD) ** 2) / (SD * np.sqrt(2 * np.pi))
-        return np.sum(np.log(spacing * seen @ density))
+        return np.sum(np.log(spacing * norm.pdf(DATA, x, SD) @ density))
 
     grid = np.meshgrid(*axes, indexing="ij")
     log_posterior = np.vectorize(log_likelihood)(*grid)
@@ -131,8 +131,7 @@ def guide_ess(guide, parameters, key):
             well(*parameters), SEEN.at(datum), x0=START, t1=1.0, num_steps=NUM_STEPS, guide=guide
         )
         noise = jr.normal(key, (1024, *bridge.noise_shape))
-        log_weights = jax.vmap(bridge.log_weight)(noise)
-        return jnp.exp(2 * jax.nn.logsumexp(log_weights) - jax.nn.logsumexp(2 * log_weights))
+        return nb.weights.effective_sample_size(jax.vmap(bridge.log_weight)(noise))
 
     return float(jnp.min(jax.jit(jax.vmap(of_datum))(DATA))) / 10.24
 
@@ -150,14 +149,7 @@ def run(make_kernel, guide, num_warmup, num_samples, key):
     )
     mcmc.run(key, DATA)
 
-    @jax.jit
-    def more(state):
-        return jax.lax.fori_loop(0, 50, lambda _, state: kernel.sample(state, (DATA,), {}), state)
-
-    state = jax.block_until_ready(more(mcmc.last_state))
-    start = time.perf_counter()
-    jax.block_until_ready(more(state))
-    seconds = (time.perf_counter() - start) / 50 * num_samples
+    seconds = seconds_of_a_draw(kernel, mcmc.last_state, DATA) * num_samples
     draws = mcmc.get_samples(group_by_chain=True)
     particles = getattr(kernel, "num_particles", None)
     return np.stack([np.asarray(draws[name]) for name in PRIORS]), seconds, particles

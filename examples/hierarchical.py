@@ -10,7 +10,7 @@
 # is each cell's own, and varies about a mean μ with a spread τ. What do ten pairs of numbers say of
 # μ, τ and σ, how well is one cell predicted from the nine others, and are they different at all?
 #
-#     python examples/hierarchical.py            # three minutes
+#     python examples/hierarchical.py            # up to ten minutes
 #     python examples/hierarchical.py --quick    # fewer draws and particles
 
 # %%
@@ -90,16 +90,20 @@ PRIORS = {
 }
 
 
+def law_of(betas, sigma):
+    """Of the ends of cells, each with its input."""
+    cells = jax.vmap(cell, in_axes=(0, None))(betas, sigma)
+    return nb.DiffusionEndpoint(
+        cells, START, seen, batch_shape=(len(betas),), batched=("sde",), **steps
+    )
+
+
 def model(observed=None, num_cells=10):
     mu, tau, sigma = [numpyro.sample(name, prior) for name, prior in PRIORS.items()]
     with numpyro.plate("cell", num_cells):
         deviation = numpyro.sample("deviation", dist.Normal(0.0, 1.0))
         beta = numpyro.deterministic("beta", mu + tau * deviation)
-        cells = jax.vmap(cell, in_axes=(0, None))(beta, sigma)
-        law = nb.DiffusionEndpoint(
-            cells, START, seen, batch_shape=(num_cells,), batched=("sde",), **steps
-        )
-        nb.sample("end", law, obs=observed)
+        nb.sample("end", law_of(beta, sigma), obs=observed)
 
 
 def model_of_equals(observed=None, num_cells=10):
@@ -157,9 +161,7 @@ def leave_one_out(log_likelihood):
 
 def given_noise(sites):
     """The log likelihood of each cell given its noise and its input, at one draw."""
-    mu, tau, sigma = [sites[name] for name in PRIORS]
-    cells = jax.vmap(cell, in_axes=(0, None))(mu + tau * sites["deviation"], sigma)
-    law = nb.DiffusionEndpoint(cells, START, seen, batch_shape=(10,), batched=("sde",), **steps)
+    law = law_of(sites["beta"], sites["sigma"])
     return law.given(sites["end_noise"]).log_prob(observed)
 
 

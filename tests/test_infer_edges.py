@@ -498,3 +498,39 @@ def test_warm_chains_on_new_data():
     assert error < 0.06
     assert abs(draws.mean() - mean) < 4 * error * sd
     assert draws.std() == pytest.approx(sd, rel=0.15)
+
+
+@pytest.fixture
+def optimized():
+    """The compiler as users have it, in a module that goes without most optimisations."""
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
+@pytest.mark.usefixtures("optimized")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_chains_start_within_another_program(dtype):
+    """Whose compiler's options are not to be changed; the key may be known, and the data not."""
+
+    def model(observed):
+        sd = numpyro.sample("sd", dist.LogNormal(jnp.zeros((), dtype), 0.3))
+        law = nb.DiffusionEndpoint(
+            nb.BrownianMotion(sd**2), np.zeros(1), nb.InexactMatch(0.1), t1=1.0, num_steps=2
+        )
+        nb.sample("x", law, obs=observed)
+
+    def start(observed, key):
+        state = FunctionSpaceHMC(model).init(key, 10, None, (observed,), {})
+        return state.potential_energy
+
+    observed = jnp.array([0.7], dtype)
+    key = jr.key(0)
+    plain = start(observed, key)
+    for traced in (
+        jax.jit(lambda: start(observed, key))(),
+        jax.jit(lambda observed: start(observed, key))(observed),
+        jax.jit(start)(observed, key),
+        jax.vmap(start)(observed[None], key[None])[0],
+    ):
+        np.testing.assert_allclose(traced, plain, rtol=2e-3)

@@ -685,6 +685,8 @@ def test_a_network_of_half_the_ess_is_not_kept():
         network, history = run(most)
         assert float(jnp.sum(network)) == pytest.approx(kept)
         assert history["update"][-1] == most
+        last = np.flatnonzero(history["kept"])[-1]
+        assert history["bound"][last] == pytest.approx(kept)
     assert float(jnp.sum(run(8, patience=None)[0])) == pytest.approx(0.8)
 
 

@@ -145,7 +145,7 @@ class AbstractBridgeKernel(MCMCKernel):
             )
 
         self._sample_fn = sample
-        options = _QUICKLY_COMPILED if _runs_here_now(rng_key, init_params) else None
+        options = _QUICKLY_COMPILED if _takes_compiler_options() else None
         state = jax.jit(start, compiler_options=options)(rng_key, init_params)
         self._check_start(state, num_chains, model_args, model_kwargs)
         return state
@@ -303,13 +303,13 @@ class AbstractBridgeKernel(MCMCKernel):
         return mean + (rate - mean) / n
 
 
-def _runs_here_now(*arguments) -> bool:
-    """Whether options of the CPU's compiler may be given: within another program JAX refuses them,
-    and they are not to undo what `jax_disable_most_optimizations` asks for.
+def _takes_compiler_options() -> bool:
+    """Those of the CPU's compiler. JAX refuses them within another program, where every array is
+    traced, and they are not to undo what `jax_disable_most_optimizations` asks for.
     """
-    traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(arguments))
+    within = isinstance(jnp.zeros(()), Tracer)
     optimized = not jax.config.read("jax_disable_most_optimizations")
-    return jax.default_backend() == "cpu" and optimized and not traced
+    return jax.default_backend() == "cpu" and optimized and not within
 
 
 def _seal_of(model_args, model_kwargs):

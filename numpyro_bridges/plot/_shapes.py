@@ -140,23 +140,22 @@ def bridge_fan(
     drawn = []
     for frame, index in enumerate(chosen):
         shift = frame * step
-        fan = {"colors": [colors[frame]], "linewidths": 0.8, "alpha": _opacity(len(paths))}
         first = frame == 0
         last = frame == num_frames - 1
+        fan = {"colors": [colors[frame]], "linewidths": 0.8, "alpha": _opacity(len(paths))}
+        fan["label"] = "bridges" if first else None
         drawn.append(draw(ax, paths[:, index] + shift, closed, **fan))
-        bold = {"linewidths": 2.2 if first else 0.9, "zorder": 3}
-        starts = draw(ax, (start + shift)[None], closed, colors=START, **bold)
-        bold = {"linewidths": 2.2 if last else 0.9, "zorder": 4}
-        dashes = "-" if last else (0, (4, 2))
-        targets = draw(ax, (target + shift)[None], closed, colors=TARGET, linestyles=dashes, **bold)
-        if first:
-            starts.set_label("start")
-            drawn[0].set_label("bridges")
-        if last:
-            targets.set_label("target")
+        width = 2.2 if first else 0.9
+        label = "start" if first else None
+        style = {"colors": START, "linewidths": width, "zorder": 3, "label": label}
+        draw(ax, (start + shift)[None], closed, **style)
+        width = 2.2 if last else 0.9
+        label = "target" if last else None
+        style = {"colors": TARGET, "linewidths": width, "zorder": 4, "label": label}
+        draw(ax, (target + shift)[None], closed, linestyles="-" if last else (0, (4, 2)), **style)
         below = ((low[0] + high[0]) / 2.0 + shift[0], low[1] + shift[1])
         label = f"$t = {times[index]:.2g}$"
-        style: dict[str, Any] = {"ha": "center", "va": "top", "fontsize": 9}
+        style = {"ha": "center", "va": "top", "fontsize": 9}
         ax.annotate(label, below, (0, -5), textcoords="offset points", **style)
     if own_axes:
         columns = 3 if direction == "row" else 1
