@@ -27,7 +27,7 @@ import numpyro_bridges as nb
 jax.config.update("jax_enable_x64", True)
 
 
-def simulated(num_steps: int):
+def simulated(num_steps: int, guide: nb.AbstractGuide | None = None):
     """The law and its data, or `None` where they are not."""
     folder = Path(
         os.environ.get("NUMPYRO_BRIDGES_DATA", Path(__file__).parents[2] / "shared" / "data")
@@ -42,7 +42,7 @@ def simulated(num_steps: int):
     )
     tree = nb.Tree.from_newick("((a:1,b:1,c:1):1,(d:1,e:1,f:1):1,(g:1,h:1,i:1):1);")
     law = nb.DiffusionTree(
-        flow, data["root"], nb.InexactMatch(1e-3), tree=tree, num_steps=num_steps
+        flow, data["root"], nb.InexactMatch(1e-3), tree=tree, num_steps=num_steps, guide=guide
     )
     return law, data["tree_leaves"]
 

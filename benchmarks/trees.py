@@ -1,6 +1,6 @@
 """What does the likelihood of a tree cost?
 
-    python benchmarks/trees.py [--quick] [--parts linear flow species rate paths large]
+    python benchmarks/trees.py [--quick] [--parts linear flow species rate paths large learned]
 
 `linear`: processes of two traits on random binary trees, value, gradient and compile time, beside
 prunings in NumPy that take all nodes of one height at once. `flow`: Kunita flows of 16 landmarks,
@@ -10,7 +10,8 @@ weight; they are read from the folder of data sets, `NUMPYRO_BRIDGES_DATA` or `.
 `rate`: how well the rate of Brownian motion is known from trees of 4 to 256 tips of 40 numbers, by
 the tree and by a dense normal law. If asked for, minutes each: `paths`, how many of 10 000 paths of
 the default guide fail, on a tree of simulated tips, from wing to wing, and on the tree of
-butterflies; `large`, 425 tips of 118 landmarks, 25 steps a branch.
+butterflies; `large`, 425 tips of 118 landmarks, 25 steps a branch; `learned`, what a network for
+all branches of the simulated tips brings to the weights, and to chains over their noise.
 
 One JSON line each, double precision, run times the minimum of several, memory the peak of the
 process.
@@ -332,6 +333,70 @@ def large(quick: bool):
     show(line)
 
 
+def learned(quick: bool):
+    """The bound and the SD of Σ log w, and effective draws of the ancestors a second."""
+    import arviz
+    from mcmc import seconds_of_a_draw
+    from numpyro.infer import MCMC
+    from tree_evidence import simulated
+
+    num_steps = 4 if quick else 20
+    case = simulated(num_steps)
+    if case is None:
+        return
+    law, tips = case
+    num_updates = 20 if quick else 600
+    guide = nb.scores.fit_tree(
+        law,
+        tips,
+        key=jr.key(0),
+        network=nb.scores.MLP((16, 2), key=jr.key(1), width=128),
+        training=nb.scores.Training(num_updates, 16, held_out=128),
+        progress=False,
+    )
+    of_training = float(guide.history["seconds"][-1])
+    for name, by in (("geodesic", None), ("learned", guide)):
+        law, _ = simulated(num_steps, by)
+
+        def log_weight(z, law=law):
+            return law.given(z).log_prob(tips)
+
+        noise = jr.normal(jr.key(2), (1024, *law.noise_prior().shape()))
+        run = jax.jit(lambda noise, f=log_weight: jax.lax.map(f, noise, batch_size=16))
+        found = run(noise)
+        line = {"guide": name, "mean": np.mean(found), "sd": np.std(found)}
+        line |= {"path_s": seconds(lambda run=run, z=noise: run(z), 2) / len(noise)}
+
+        def model(law=law):
+            nb.sample("tips", law, obs=tips)
+
+        kernel = nb.infer.FunctionSpaceHMC(model)
+        num_draws = 20 if quick else 300
+        mcmc = MCMC(
+            kernel,
+            num_warmup=num_draws // 2,
+            num_samples=num_draws,
+            num_chains=4,
+            chain_method="vectorized",
+            progress_bar=False,
+        )
+        mcmc.run(jr.key(3), extra_fields=nb.infer.fields(kernel))
+        (draws,) = mcmc.get_samples().values()
+        nodes = jax.jit(
+            lambda draws, law=law: jax.lax.map(
+                lambda z: law.given(z).nodes(tips)[jnp.array(law.tree.parents[1:])], draws
+            )
+        )(draws)
+        inner = np.asarray(nodes).reshape(4, num_draws, -1)
+        inner = inner[..., np.std(inner, axis=(0, 1)) > 0]
+        ess = min(float(arviz.ess(inner[..., i])) for i in range(inner.shape[2]))
+        a_draw = seconds_of_a_draw(kernel, mcmc.last_state)
+        line |= {"least_ess_of_ancestors": ess, "draws": 4 * num_draws, "draw_of_all_s": a_draw}
+        line |= {"ess_per_s": ess / num_draws / a_draw}
+        line |= {"accept": np.mean(mcmc.get_extra_fields()["accept_prob"])}
+        show(line | ({} if by is None else {"training_s": of_training}))
+
+
 def show(line):
     rounded = {
         key: x if isinstance(x, (str, int)) else float(f"{x:.4g}") for key, x in line.items()
@@ -343,7 +408,7 @@ def main():
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="small trees only")
-    parts = ("linear", "flow", "species", "rate", "paths", "large")
+    parts = ("linear", "flow", "species", "rate", "paths", "large", "learned")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts[:4])
     arguments = parser.parse_args()
     quick = arguments.quick
@@ -362,6 +427,8 @@ def main():
         paths(100 if quick else 10_000)
     if "large" in arguments.parts:
         large(quick)
+    if "learned" in arguments.parts:
+        learned(quick)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@
 # - **varifolds** of outlines with uneven points of their own.
 #
 # Chords lie inside a curve: outlines of few points differ by more than their curves do. See how the
-# answer of the varifolds moves with `--points` and `--curve-points`.
+# answer of the varifolds moves with `--points` and `--curve-points`; with `--same-points` outlines
+# have the landmarks for their points, and nothing is left but what the matches see.
 #
 #     python examples/outlines.py
 #     python examples/outlines.py --quick    # some minutes, most of which is compilation
@@ -57,6 +58,9 @@ parser.add_argument("--specimens", type=int, default=6)
 parser.add_argument("--points", type=int, default=32, help="of a state of the flow")
 parser.add_argument(
     "--curve-points", type=int, default=40, help="of an outline, each at places of its own"
+)
+parser.add_argument(
+    "--same-points", action="store_true", help="the landmarks are the points of outlines too"
 )
 parser.add_argument("--steps", type=int, default=10)
 parser.add_argument("--warmup", type=int, default=100)
@@ -103,7 +107,12 @@ mean = smoothed(wings.mean)
 outlines = np.stack([smoothed(outline) for outline in wings.points[: arguments.specimens]])
 own = places(mean, arguments.points)
 start, landmarks = mean[own], outlines[:, own]
-curves = np.stack([outline[places(outline, arguments.curve_points, rng)] for outline in outlines])
+if arguments.same_points:
+    curves = landmarks
+else:
+    curves = np.stack(
+        [outline[places(outline, arguments.curve_points, rng)] for outline in outlines]
+    )
 space = nb.Landmarks(arguments.points, 2)
 print(
     f"{len(outlines)} wings: spread of a coordinate {np.std(landmarks - start):.4f}, error of a "
@@ -132,7 +141,7 @@ def across(x, observed, args):
 
 def varifold(variance):
     """Edges within some 0.4 of each other are one place, and 60° one direction."""
-    return nb.VarifoldMatch(variance, 0.4, num_points=arguments.curve_points)
+    return nb.VarifoldMatch(variance, 0.4, num_points=curves.shape[1])
 
 
 def flow_of(amplitude, length_scale):

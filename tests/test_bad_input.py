@@ -104,6 +104,7 @@ TRAINED = nb.ScoreGuide(
 ESTIMATE = nb.EvidenceEstimate(ONE, ONE, ONE, 0.1, 0.1, jnp.zeros(4))
 SPECIMEN = io.Specimen(SQUARE, id="a")
 TREE = nb.Tree.from_newick("((a:1,b:2):1,c:3);")
+TREE_LAW = nb.DiffusionTree(OU, X, MATCH, tree=TREE)
 
 
 def model(observed=None):
@@ -139,6 +140,7 @@ OBJECTS = {
     "bridge": BRIDGE,
     "training": TRAINING,
     "law": LAW,
+    "tree law": TREE_LAW,
     "standard": STANDARD,
     "trained": TRAINED,
     "comparison": COMPARISON,
@@ -149,7 +151,12 @@ OBJECTS = {
 }
 """One object of each kind; what is asked for is replaced by any of the others, or by its class."""
 
-ARE_TOO = {"sde": {"linear"}, "linear": {"sde"}, "guide": {"trained"}}
+ARE_TOO = {
+    "sde": {"linear"},
+    "linear": {"sde"},
+    "guide": {"trained"},
+    "law": {"tree law"},
+}
 
 
 @dataclass
@@ -722,6 +729,21 @@ def table() -> dict[str, Row]:
             watch="function?",
             mesh="mesh?",
             **GUIDED | {"num_steps": ("count?", 2)},
+        ),
+        "scores.fit_tree": row(
+            scores.fit_tree,
+            True,
+            law=("tree law", TREE_LAW),
+            data=("array", np.zeros((3, len(X)))),
+            key=("key", KEY),
+            network="function?",
+            training=("training?", TRAINING),
+            draw="function?",
+            context="function?",
+            directory="path?",
+            progress=("flag", False),
+            watch="function?",
+            mesh="mesh?",
         ),
         # data and drawings
         "datasets.mosquito_wings": row(

@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 
 import numpyro_bridges as nb
 from numpyro_bridges.distributions._tree import _divided, _problem, _simulated
+from numpyro_bridges.guiding._score import Standard
 from numpyro_bridges.infer import FunctionSpaceHMC
 from numpyro_bridges.trees._schedule import schedule
 
@@ -659,8 +660,13 @@ def test_evidence_by_brute_force(name):
 
 
 FLOW = nb.KunitaFlow(nb.Landmarks(3, 2), nb.GaussianKernel(0.4, 0.7))
+WIGGLY = nb.ScoreGuide(
+    nb.GeodesicGuide(),
+    lambda t, x, v, theta: jnp.sin(2 * x + t) + 0.3 * v,
+    Standard(*map(jnp.asarray, (1.0, 0.8, 0.0, 1.0, np.zeros(0), np.zeros(0)))),
+)
 KINDS = {
-    "inexact, inner node seen": (nb.InexactMatch(0.1), TREE, None),
+    "learned, inner node seen": (nb.InexactMatch(0.1), TREE, WIGGLY),
     "exact": (nb.ExactMatch(), nb.Tree.from_newick("((a:1,b:1.5):2,(c:3,d:.5):.3,g:2):.3;"), None),
     "some points": (nb.InexactMatch(0.1, PICK := np.eye(3)[[2, 0]]), TREE, nb.FrozenGuide()),
     "chain": (nb.InexactMatch(0.1), nb.Tree.chain([0.5, 0.7, 2.0]), None),

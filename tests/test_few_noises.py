@@ -57,12 +57,20 @@ def normal_log_density(r, S):
     )
 
 
-@pytest.mark.parametrize("end_weight", [0.0, 0.3])
+LED_BY = {
+    "receding": (nb.RecedingGuide(), 0.0),
+    "receding-mixed": (nb.RecedingGuide(0.3), 0.3),
+    "frozen": (nb.FrozenGuide(), 1.0),
+}
+
+
+@pytest.mark.parametrize("guide", LED_BY)
 @pytest.mark.parametrize("name", MATCHES)
-def test_weight_is_that_of_dense_normals(name, end_weight, key):
+def test_weight_is_that_of_dense_normals(name, guide, key):
     """u ~ N(AᵀS⁻¹r, I − AᵀS⁻¹A) at every step, with S of all that is seen, in NumPy."""
     match = MATCHES[name]
-    b = bridge(match, nb.RecedingGuide(end_weight), v=seen(match))
+    guide, end_weight = LED_BY[guide]
+    b = bridge(match, guide, v=seen(match))
     assert b.noise_shape == (NUM_STEPS, 8, 2)
     z = jr.normal(key, b.noise_shape)
     path, found = (np.asarray(a) for a in b.path_and_log_weight(z))

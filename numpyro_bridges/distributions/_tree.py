@@ -36,7 +36,7 @@ from ..conditioning import AbstractDensityMatch, AbstractMatch, fused
 from ..guiding import AbstractGuide, default_guide
 from ..sdes import AbstractSDE, Flattened, as_covariance, for_every_column
 from ..trees import Root, Tree, TreeProblem
-from ._batch import as_shape, find_batched, one_of
+from ._batch import as_datum, as_shape, find_batched, one_of
 from ._driving_noise import NoiseBlocks
 from ._endpoint import check_law, close_parts, example, names_of
 from ._noise_driven import AbstractNoiseDriven
@@ -244,6 +244,18 @@ class DiffusionTree(AbstractNoiseDriven):
         since all below depends on the state.
         """
         return self._log_prob_by(_by_node, (len(set(self.tree.observed)),), observed)
+
+    def problem(self, observed, name: str = "observed") -> TreeProblem:
+        """What is weighed, of one tree, for `scores.fit_tree`; `name` is that of `observed` in
+        errors.
+        """
+        require(
+            self.shape() == self.event_shape and not self._moved,
+            f"`law` must be of one tree; it has batch shape {self._full_shape}.",
+        )
+        observed = as_datum(observed, name)
+        self._check_value(observed, name)
+        return _problem(self.parts, jnp.broadcast_to(observed, self.shape()))
 
     def path(self, observed):
         """Paths to `observed` that the bound noise drives, batch axes and then `(branches,
@@ -536,8 +548,7 @@ def _simulated(parts, key):
     problem = _without_data(parts)
     sde = problem.sde
     x0 = problem.x0
-    shape = (problem.num_noises, sde.noise_size(x0), *x0.shape[1:])
-    paths = problem.simulate(jr.normal(key_path, shape, x0.dtype))
+    paths = problem.simulate(jr.normal(key_path, problem.noise_shape, x0.dtype))
     # one state for each row: rows of one node have the same, and errors of their own
     ends = _unflat(parts, problem.at_nodes(paths)[np.array(tree.observed)])
     sde = parts["sde"] if "sde" not in parts["settings"].per_edge else _first(parts["sde"])

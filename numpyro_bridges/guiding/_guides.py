@@ -66,6 +66,12 @@ class AbstractPlan(eqx.Module):
         """What the guide adds to the score of its message: a learned guide's network."""
         return jnp.zeros_like(x)
 
+    def bare(self) -> "AbstractPlan":
+        """Without what it shares with all plans of its guide, of which a tree would hold a copy for
+        each branch. `AbstractGuide.whole` gives it back.
+        """
+        return self
+
 
 class AbstractGuide(eqx.Module):
     """A way to lead paths to what is observed. A subclass gives `plan`.
@@ -129,6 +135,10 @@ class AbstractGuide(eqx.Module):
         on from there.
         """
         return False
+
+    def whole(self, plan: AbstractPlan) -> AbstractPlan:
+        """A plan of this guide that was made `bare`."""
+        return plan
 
     def check(self, sde: AbstractSDE, x: State) -> None:
         """`ValueError` where the guide does not fit states shaped like x."""
@@ -219,8 +229,26 @@ class FrozenGuide(AbstractGuide):
         return smoothed(self, sde, seen, observed, reference, ts, start)
 
     def plan(self, sde, seen, reference, ts, steps: AffineStep | None = None):
-        steps = self.steps(sde, reference, ts) if steps is None else steps
+        if steps is not None:
+            return _FrozenPlan(backward_filter(steps, seen), seen.exact)
+        steps = self.steps(sde, reference, ts)
+        sigma, a = sde.noise(ts[-1], reference)
+        is_number = steps.operator.ndim == 1  # the first axis is that of the steps
+        if (
+            is_number
+            and self._has_the_noise_of_the_end(sde, reference)
+            and is_low_rank(sigma, seen)
+        ):
+            # all the time left is bridged by the covariance of the end: no matrix of all values
+            end = _End(jnp.ones((), reference.dtype), a)
+            return accumulated_plan(steps, seen, reference, ts, sigma, end)
         return _FrozenPlan(backward_filter(steps, seen), seen.exact)
+
+    def _has_the_noise_of_the_end(self, sde: Displaced, reference: State) -> bool:
+        """Whether every step has the σ of the end, times √dt."""
+        other = self.auxiliary is not None or self.way is not None
+        euler = not sde.sde.has_exact_transition or isinstance(sde.sde, BrownianMotion)
+        return euler and not other and sde.is_autonomous(reference)
 
     def steps(self, sde: Displaced, reference: State, ts) -> AffineStep:
         """The steps of the auxiliary process, of which a plan may be told if they are known."""
@@ -438,31 +466,44 @@ class RecedingGuide(AbstractGuide):
             operator = kept
             ndim = 1
 
-        def back(carry, inputs):
-            """From the end of a step, whose Ψ is in the carry, to its start."""
-            flow, total, kappa = carry
-            phi, beta, dt = inputs
-            # noise and shift of a step come at its end, the flow acts from its start
-            kappa = kappa + dt * _square(flow)
-            total = total + apply(compose(seen.operator, flow), beta)
-            flow = compose(flow, phi)
-            return (flow, total, kappa), (flow, total, kappa)
-
-        one = promote(jnp.ones((), reference.dtype), ndim, n)
-        # The carry of a scan keeps its shape, so `beyond`, a number, is given that of κ.
-        beyond = beyond + jnp.zeros_like(_square(one))
-        start = (one, jnp.zeros_like(apply(seen.operator, reference)), beyond)
-        start = varying_like(start, seen, operator, shift, ts)
-        _, planned = jax.lax.scan(back, start, (operator, shift, jnp.diff(ts)), reverse=True)
+        steps = AffineStep(operator, shift, steps.covariance)
         sigma, a = sde.noise(ts[-1], reference)
         w = self.end_weight
         end = None if w is None else _End(w, a)
-        errors = None
-        # With a diagonal or full Ψ the sum over steps has a higher rank than σ.
-        if is_low_rank(sigma, seen) and ndim == 0:
-            assert seen.factor is not None
-            errors = Errors.of(seen.factor, None if w is None else compose(seen.operator, sigma))
-        return RecedingPlan(planned, seen, end, errors)
+        return accumulated_plan(steps, seen, reference, ts, sigma, end, beyond)
+
+
+def accumulated_plan(
+    steps: AffineStep, seen: Observation, reference: State, ts, sigma, end: _End | None, beyond=0.0
+) -> RecedingPlan:
+    """Of a process with these linear steps, and with the covariance that a path has; `sigma` is
+    that of the end.
+    """
+    ndim = steps.operator.ndim - 1
+
+    def back(carry, inputs):
+        """From the end of a step, whose Ψ is in the carry, to its start."""
+        flow, total, kappa = carry
+        phi, beta, dt = inputs
+        # noise and shift of a step come at its end, the flow acts from its start
+        kappa = kappa + dt * _square(flow)
+        total = total + apply(compose(seen.operator, flow), beta)
+        flow = compose(flow, phi)
+        return (flow, total, kappa), (flow, total, kappa)
+
+    one = promote(jnp.ones((), reference.dtype), ndim, reference.shape[0])
+    # The carry of a scan keeps its shape, so `beyond`, a number, is given that of κ.
+    beyond = beyond + jnp.zeros_like(_square(one))
+    start = (one, jnp.zeros_like(apply(seen.operator, reference)), beyond)
+    start = varying_like(start, seen, steps.operator, steps.shift, ts)
+    inputs = steps.operator, steps.shift, jnp.diff(ts)
+    _, planned = jax.lax.scan(back, start, inputs, reverse=True)
+    errors = None
+    # With a diagonal or full Ψ the sum over steps has a higher rank than σ.
+    if is_low_rank(sigma, seen) and ndim == 0:
+        assert seen.factor is not None
+        errors = Errors.of(seen.factor, None if end is None else compose(seen.operator, sigma))
+    return RecedingPlan(planned, seen, end, errors)
 
 
 class DriftGuide(AbstractGuide):

@@ -155,9 +155,14 @@ class ScoreGuide(AbstractGuide):
         object.__setattr__(prepared, "programs", self.programs)
         return prepared
 
-    def plan(self, sde, seen, reference, ts):
+    def follows(self, sde, seen, reference):
+        return self.guide.follows(sde, seen, reference)
+
+    def plan(self, sde, seen, reference, ts, *beyond):
         network, context = self.programs
-        base = self.guide.plan(sde, seen, reference, ts)
+        # `beyond`, the time from the end until the state is seen, is for a base that follows
+        base = self.guide.plan(sde, seen, reference, ts, *beyond)
+        left = ts[-1] + sum(beyond) - ts[:-1]
         n = reference.shape[0]
         dtype = reference.dtype
         weights = jnp.ones(n, dtype) if sde.space is None else sde.space.weights.astype(dtype)
@@ -172,9 +177,14 @@ class ScoreGuide(AbstractGuide):
         target = self.standard.target(v + sde.origin.reshape(v.shape), pooled)
         inputs = v, target, theta
         network = self.network if network is None else network
-        return ScorePlan(
-            (base.steps, ts[-1] - ts[:-1]), base, network, self.held, self.standard, unit, inputs
-        )
+        return ScorePlan((base.steps, left), base, network, self.held, self.standard, unit, inputs)
+
+    def whole(self, plan):
+        assert isinstance(plan, ScorePlan)
+        network, _ = self.programs
+        network = self.network if network is None else network
+        base = self.guide.whole(plan.base)
+        return replace(plan, base=base, network=network, held=self.held)
 
 
 class ScorePlan(AbstractPlan):
@@ -182,11 +192,14 @@ class ScorePlan(AbstractPlan):
 
     steps: tuple[Any, Float[Array, " K"]]
     base: AbstractPlan
-    network: Callable
-    held: Callable | None
+    network: Any
+    held: Any
     standard: Standard
     unit: Float[Array, " n"]
     fixed: tuple[Array, Array, Array]
+
+    def bare(self):
+        return replace(self, base=self.base.bare(), network=None, held=None)
 
     def inputs(self, left, x: State) -> tuple[Array, Array, Array, Array]:
         """What the network sees at x, a time `left` before the end."""

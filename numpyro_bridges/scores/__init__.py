@@ -1,7 +1,7 @@
 """Learned guides: networks that correct a guide, and ways to train them."""
 
 from ..guiding import ScoreGuide as ScoreGuide, Unguided as Unguided
-from ._fit import fit as fit
+from ._fit import fit as fit, fit_tree as fit_tree
 from ._networks import (
     MLP as MLP,
     PointNetwork as PointNetwork,

@@ -32,6 +32,7 @@ from .._linalg import apply, full_precision
 from .._types import RealScalar, State
 from ..bridges import GuidedBridge
 from ..conditioning import AbstractCondition
+from ..distributions import DiffusionTree
 from ..guiding import (
     AbstractGuide,
     FrozenGuide,
@@ -43,6 +44,7 @@ from ..guiding import (
 )
 from ..sdes import AbstractSDE, BrownianMotion, LinearSDE
 from ..spaces import Landmarks
+from ..trees import TreeProblem
 from ._clouds import (
     Cloud,
     adjoint_cloud,
@@ -64,12 +66,14 @@ _POINTS = 16
 _MATCHED = 16
 
 Draw = Callable[[PRNGKeyArray], tuple[AbstractSDE, AbstractCondition, State]]
+DrawTree = Callable[[PRNGKeyArray], tuple[DiffusionTree, Array]]
 
 
 class Problem(NamedTuple):
-    """Bridges `draw(key)` that one network is to guide, and how it is trained."""
+    """Bridges `draw(key)` that one network is to guide, or trees, and how it is trained."""
 
-    draw: Callable[[PRNGKeyArray], GuidedBridge]
+    draw: Callable[[PRNGKeyArray], Any]
+    """A `GuidedBridge`, or a `TreeProblem`, which `residual` takes like one."""
     amortised: bool
     guide: ScoreGuide
     training: Training
@@ -77,6 +81,8 @@ class Problem(NamedTuple):
     mesh: Mesh | None = None
     stride: RealScalar = jnp.inf
     """Of the clouds, see `_clouds`."""
+    knows_ess: bool = True
+    """Whether the ESS of held-out paths says anything: of a tree a few weights have nearly all."""
 
     def spread(self, fn: Callable, size: int) -> Callable:
         """`fn` for a batch of a size; whole on each device where that has no equal shares."""
@@ -160,21 +166,9 @@ def fit(
         "a network of such states cannot be learned. Fit one for an `InexactMatch` near it, or "
         "use the default guide.",
     )
-    training = Training() if training is None else training
     bridge = _better(bridge, key) if guide is None else bridge
-    require_instance(training, Training, "training", "a `Training(...)`")
-    for name, function, meant in (
-        ("context", context, "of the SDE"),
-        ("network", network, "(t, x, v, theta)"),
-        ("draw", draw, "of a key that gives (sde, condition, x0)"),
-        ("watch", watch, "(name, guide)"),
-    ):
-        good = function is None or callable(function)
-        require(good, f"`{name}` must be a function {meant}; got {words(function)}.")
-    progress = flag(progress, "progress")
-    for name in ("batch_size", "held_out"):
-        mesh_for(getattr(training, name), f"`{name}` of `training`", mesh)
-    folder = None if directory is None else as_path(directory, "directory")
+    training, progress, folder = _checked_settings(training, progress, directory, mesh)
+    _check_functions(context, network, watch, draw, "(sde, condition, x0)")
     key_network, key_pilot, key_train = jr.split(key, 3)
 
     def draw_bridge(key):
@@ -183,33 +177,123 @@ def fit(
         sde, condition, x0 = draw(key)
         return GuidedBridge(sde, condition, x0=x0, ts=bridge.grid, guide=bridge.guide)
 
-    if network is None:
-        size = 0 if context is None else context(sde).shape[0]
-        n, dim = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
-        if isinstance(sde.space, Landmarks):
-            network = PointNetwork(dim, size, key=key_network)
-        else:
-            network = MLP((n, dim), size, key=key_network)
+    network = _network(network, bridge, context, key_network)
     start, stride = _untrained(
-        network, draw_bridge, context, key_pilot, lambda bridge: bridge.end()[1]
-    )
-    problem = Problem(
+        network,
         draw_bridge,
-        draw is not None,
-        start,
-        training,
-        partial(
-            _train,
-            given=bridge,
-            directory=folder,
-            progress=progress,
-            watch=watch,
-            mesh=mesh,
-        ),
-        mesh,
-        stride,
+        context,
+        key_pilot,
+        lambda bridge, noise: (bridge.path(noise), bridge.end()[1]),
+        bridge.grid.elapsed[-1],
     )
+    train = partial(
+        _train, given=bridge, directory=folder, progress=progress, watch=watch, mesh=mesh
+    )
+    problem = Problem(draw_bridge, draw is not None, start, training, train, mesh, stride)
     return METHODS[method](problem, key_train)
+
+
+@full_precision
+def fit_tree(
+    law: DiffusionTree,
+    data: ArrayLike,
+    *,
+    key: PRNGKeyArray,
+    network: Callable | None = None,
+    training: Training | None = None,
+    draw: DrawTree | None = None,
+    context: Callable[[Any], Array] | None = None,
+    directory: str | Path | None = None,
+    progress: bool = True,
+    watch: Callable[[str, ScoreGuide], None] | None = None,
+    mesh: Mesh | None = None,
+) -> ScoreGuide:
+    """Trains a network that corrects the guide of a tree, one for all its branches.
+
+        guide = scores.fit_tree(law, data, key=key)
+        DiffusionTree(sde, x0, match, tree=tree, num_steps=10, guide=guide)
+
+    By the method `"residual"` of `fit`: the evidence bound E Ψ over paths along all branches is
+    maximised, and what a network has learned of a branch is told apart from the rest by the time
+    left and by what the branch leads to. Weights are exact whatever was learned.
+
+    **Arguments:**
+
+    - `law`: a `DiffusionTree`, whose guide is the one that is corrected. `data`: as `obs=` takes
+      them.
+    - `draw`: `draw(key)` gives `(law, data)` on a tree of the same topology, for a guide that
+      serves many: other parameters, lengths or data. `context(sde)`, `(c,)`, are the parameters
+      that the network is told.
+    - `network`, `training`, `directory`, `progress`, `watch`, `mesh`: as for `fit`. The networks
+      that it has by default are those of `fit`.
+
+    `history` is that of `fit` but for `ess`, which is NaN: of a tree a few weights have nearly all,
+    and the bound alone says what was learned.
+
+    **Errors:** `ValueError` for several trees at once and for data that do not fit.
+    """
+    require_instance(law, DiffusionTree, "law", "a `DiffusionTree`")
+    require_key(key)
+    training, progress, folder = _checked_settings(training, progress, directory, mesh)
+    _check_functions(context, network, watch, draw, "(law, data)")
+    tree = law.problem(data, "data")
+    require(
+        tree.x0.ndim == law.parts["x0"].ndim,
+        "`law` has a match known by its density, for which states of several columns are "
+        "flattened: a network of such states cannot be learned. Fit one for an `InexactMatch` near "
+        "it, or use the default guide.",
+    )
+    key_network, key_pilot, key_train = jr.split(key, 3)
+
+    def draw_tree(key):
+        if draw is None:
+            return tree
+        other, data = draw(key)
+        return other.problem(data).with_guide(tree.guide)
+
+    def ways(tree, noise):
+        # with its end a path has what its branch leads to
+        paths = tree.paths(noise)
+        return paths, paths[:, -1]
+
+    network = _network(network, tree, context, key_network)
+    height = law.tree.height.astype(tree.x0.dtype)
+    start, _ = _untrained(network, draw_tree, context, key_pilot, ways, height)
+    train = partial(_train, given=tree, directory=folder, progress=progress, watch=watch, mesh=mesh)
+    amortised = draw is not None
+    problem = Problem(draw_tree, amortised, start, training, train, mesh, knows_ess=False)
+    return residual(problem, key_train)
+
+
+def _checked_settings(training, progress, directory, mesh) -> tuple[Training, bool, Path | None]:
+    training = Training() if training is None else training
+    require_instance(training, Training, "training", "a `Training(...)`")
+    for name in ("batch_size", "held_out"):
+        mesh_for(getattr(training, name), f"`{name}` of `training`", mesh)
+    folder = None if directory is None else as_path(directory, "directory")
+    return training, flag(progress, "progress"), folder
+
+
+def _check_functions(context, network, watch, draw, drawn: str) -> None:
+    for name, function, meant in (
+        ("context", context, "of the SDE"),
+        ("network", network, "(t, x, v, theta)"),
+        ("draw", draw, f"of a key that gives {drawn}"),
+        ("watch", watch, "(name, guide)"),
+    ):
+        good = function is None or callable(function)
+        require(good, f"`{name}` must be a function {meant}; got {words(function)}.")
+
+
+def _network(network, bridge: GuidedBridge | TreeProblem, context, key) -> Callable:
+    """That which was given, or the default."""
+    if network is not None:
+        return network
+    size = 0 if context is None else context(bridge.sde).shape[0]
+    n, dim = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
+    if isinstance(bridge.sde.space, Landmarks):
+        return PointNetwork(dim, size, key=key)
+    return MLP((n, dim), size, key=key)
 
 
 def _better(bridge: GuidedBridge, key: PRNGKeyArray, num_paths: int = 256) -> GuidedBridge:
@@ -343,7 +427,12 @@ def reversal(problem: Problem, key: PRNGKeyArray) -> ScoreGuide:
     context = problem.guide.context
     network = problem.guide.network
     start, stride = _untrained(
-        network, problem.draw, context, key_standard, lambda bridge: bridge.x0
+        network,
+        problem.draw,
+        context,
+        key_standard,
+        lambda bridge, noise: (bridge.path(noise), bridge.x0),
+        bridge.grid.elapsed[-1],
     )
     forward = partial(forward_cloud, stride=stride)
     start = replace(start, context=None if context is None else lambda sde: context(sde.sde))
@@ -441,10 +530,9 @@ def _gain(name: str, before, after) -> dict[str, Array]:
     few = differences.size < _LEAST_HELD_OUT
     error = np.nan if few else np.std(differences, ddof=1) / np.sqrt(differences.size)
     ess, ess_before = (100 * float(found[2]) for found in (after, before))
-    bounds = (
-        f"its bound is {gain:.2g} ± {error:.1g} nats above the guide's, "
-        f"its ESS {ess:.3g} % ({ess_before:.3g} %)"
-    )
+    bounds = f"its bound is {gain:.2g} ± {error:.1g} nats above the guide's"
+    if np.isfinite(ess):
+        bounds += f", its ESS {ess:.3g} % ({ess_before:.3g} %)"
     # of a guide that fails any network is a gain
     failed = not np.isfinite(before[1]) and np.isfinite(after[1])
     if bool(before[0] == jnp.inf):
@@ -590,7 +678,8 @@ def _judge(problem: Problem, key: PRNGKeyArray):
             bridge = problem.draw(key_draw).with_guide(replace(problem.guide, network=network))
             noise = jr.normal(key_noise, (half, *bridge.noise_shape), bridge.x0.dtype)
             log_weights = over_paths(bridge.log_weight)(jnp.concatenate([noise, -noise]))
-            ess = weights.effective_sample_size(log_weights) / (2 * half)
+            known = problem.knows_ess
+            ess = weights.effective_sample_size(log_weights) / (2 * half) if known else jnp.nan
             pairs = (log_weights[:half] + log_weights[half:]) / 2
             return pairs, ess, jnp.std(log_weights)
 
@@ -607,41 +696,43 @@ def _judge(problem: Problem, key: PRNGKeyArray):
 
 
 def _untrained(
-    network, draw, context, key, target, num_paths: int = 64
+    network, draw, context, key, ways, duration, num_paths: int = 64
 ) -> tuple[ScoreGuide, Array]:
     """The guide with its network as it is, standardised on paths of the guide that it corrects.
 
-    `target(bridge)` is the v of which x − v is the displacement. And the stride of clouds,
-    `_STRIDE` times the largest displacement of these paths.
+    `ways(bridge, noise)` are its path `(K + 1, n, dim)` and the v of which x − v is the
+    displacement, or several with an axis in front. And the stride of clouds, `_STRIDE` times the
+    largest displacement of these paths.
     """
+    bridge = draw(key)
+    n, dim = bridge.x0.reshape(bridge.x0.shape[0], -1).shape
 
     def one(key):
         key_draw, key_noise = jr.split(key)
         bridge = draw(key_draw)
-        path = bridge.path(jr.normal(key_noise, bridge.noise_shape, bridge.x0.dtype))
+        path, v = ways(bridge, jr.normal(key_noise, bridge.noise_shape, bridge.x0.dtype))
         theta = jnp.zeros(0) if context is None else context(bridge.sde)
-        v = target(bridge)
-        return path.reshape(*path.shape[:2], -1), v.reshape(v.shape[0], -1), theta
+        v = v.reshape(-1, 1, n, dim)
+        return path.reshape(len(v), -1, n, dim) - v, v, theta
 
-    paths, v, theta = jax.jit(jax.vmap(one))(jr.split(key, num_paths))
-    bridge = draw(key)
-    lost = int(jnp.sum(~jnp.all(jnp.isfinite(paths), axis=(1, 2, 3))))
+    away, v, theta = jax.jit(jax.vmap(one))(jr.split(key, num_paths))
+    lost = int(jnp.sum(~jnp.all(jnp.isfinite(away), axis=(1, 2, 3, 4))))
     require(
         lost == 0,
         f"`sde` must have paths that stay finite, and {lost} of {num_paths} led by the guide do "
         "not: its drift "
         "explodes, or a step is too long for it. Increase `num_steps`, or give another `guide`.",
     )
-    duration = bridge.grid.elapsed[-1]
     pooled = isinstance(bridge.sde.space, Landmarks)
-    away = jnp.mean((paths - v[:, None]) ** 2, axis=(0, 1))
+    largest = jnp.max(jnp.abs(away))
+    away = jnp.mean(away**2, axis=(0, 1, 2))
     if pooled:
         centre = jnp.zeros(())
-        width = jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=1, keepdims=True)) ** 2))
+        width = jnp.sqrt(jnp.mean((v - jnp.mean(v, axis=3, keepdims=True)) ** 2))
         away = jnp.mean(away)
     else:
-        centre = jnp.mean(v, axis=0)
-        width = jnp.std(v, axis=0)
+        centre = jnp.mean(v, axis=(0, 1, 2))
+        width = jnp.std(v, axis=(0, 1, 2))
         width = jnp.where(width > 1e-6 * (1 + jnp.abs(centre)), width, 1.0)
     scale = jnp.sqrt(away)
     scale = jnp.where(scale > 1e-6 * jnp.max(scale), scale, 1.0)
@@ -657,7 +748,7 @@ def _untrained(
     standard = Standard(duration, scale, centre, width, jnp.mean(theta, axis=0), deviation)
     guide = ScoreGuide(bridge.guide, network, standard, context)
     _check_output(guide, bridge)
-    return guide, _STRIDE * jnp.max(jnp.abs(paths - v[:, None]))
+    return guide, _STRIDE * largest
 
 
 def _check_output(guide: ScoreGuide, bridge: GuidedBridge) -> None:

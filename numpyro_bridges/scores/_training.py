@@ -260,9 +260,8 @@ def train(
             if file is not None and is_writer(mesh):
                 _save(file, state, label)
             row = {k: float(np.asarray(v)[-1]) for k, v in _rows(state).items()}
-            bar.set_postfix_str(
-                f"loss {row['loss']:.4g}, bound {row['bound']:.4g}, ESS {100 * row['ess']:.1f} %"
-            )
+            ess = "" if np.isnan(row["ess"]) else f", ESS {100 * row['ess']:.1f} %"
+            bar.set_postfix_str(f"loss {row['loss']:.4g}, bound {row['bound']:.4g}{ess}")
             bar.update(done)
             show(state)
     return eqx.combine(state.best, static), _rows(state)

@@ -168,6 +168,15 @@ class TreeProblem(eqx.Module):
         return self.num_root_rows + len(self.schedule.active) * self.num_steps
 
     @property
+    def noise_shape(self) -> tuple[int, ...]:
+        """Of what `log_weight` takes."""
+        return self.num_noises, self.sde.noise_size(self.x0), *self.x0.shape[1:]
+
+    def with_guide(self, guide: AbstractGuide) -> "TreeProblem":
+        """Led otherwise, by a guide that follows if this one does."""
+        return replace(self, guide=guide)
+
+    @property
     def follows(self) -> bool:
         """Whether a node's data are told by a mean, for the guide's covariances to follow."""
         # κ is a time under one covariance, and branches with SDEs of their own have several
@@ -266,10 +275,12 @@ class TreeProblem(eqx.Module):
 
         def inner(branch, plan, w, path, key):
             ts = self._grid(branch.length, False)
+            plan = self.guide.whole(plan)
             return retrace(self._edge(branch), plan, ts, path - branch.anchor, w, key)
 
         def end(led, branch, path, key):
             plan, seen, observed, ts = led
+            plan = self.guide.whole(plan)
             y = path - branch.anchor
             # the path's own end: the datum less the anchor may differ from it by rounding
             observed = apply(seen.operator, y[-1]) if seen.exact else observed
@@ -363,7 +374,7 @@ class TreeProblem(eqx.Module):
             assert isinstance(self.guide, FrozenGuide)
             return self.guide.plan(edge, seen, reference, ts, branch.steps)
         guide = self._prepared(branch, seen, observed, reference, ts)
-        return guide.plan(edge, seen, reference, ts, *beyond)
+        return guide.plan(edge, seen, reference, ts, *beyond).bare()
 
     def _prepared(
         self, branch: Branch, seen: Observation, observed: State, reference: State, ts
@@ -423,7 +434,7 @@ class TreeProblem(eqx.Module):
         reference = lift(seen.operator, here, observed) if self.follows else here
         guide = self._prepared(branch, seen, observed, reference, ts)
         plan = guide.plan(self._edge(branch), seen, reference, ts)
-        return Led(plan, seen, observed, ts)
+        return Led(plan.bare(), seen, observed, ts)
 
     def up(self) -> UpwardPass:
         """Messages, from the ends to the root."""
@@ -571,6 +582,7 @@ class TreeProblem(eqx.Module):
 
         def inner_branch(branch, plan, w, z, x):
             ts = self._grid(branch.length, False)
+            plan = self.guide.whole(plan)
             path, _, log_weight = travel(self._edge(branch), plan, ts, x - branch.anchor, z, w)
             return jnp.concatenate([x[None], branch.anchor[None] + path]), log_weight
 
@@ -597,6 +609,7 @@ class TreeProblem(eqx.Module):
 
         def end(led, branch, x, z):
             plan, seen, observed, ts = led
+            plan = self.guide.whole(plan)
             path, log_weight = reach(
                 self._edge(branch), plan, seen, ts, x - branch.anchor, z, observed
             )
@@ -645,4 +658,5 @@ def _picked_out(by_round, schedule: Schedule):
     places, taken = schedule.places()
     # where in the flattened rounds the nodes are, by their number in `inner`
     at = np.flatnonzero(taken)[np.argsort(places[taken])]
-    return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[at], by_round)
+    # no −1: an array may be empty, as the context of a learned guide is that has none
+    return jax.tree.map(lambda a: a.reshape(places.size, *a.shape[2:])[at], by_round)
