@@ -80,7 +80,9 @@ def _context(function: Any) -> Any:
 
 
 class ScoreGuide(AbstractGuide):
-    """Another guide, corrected by a network. `numpyro_bridges.scores.fit` trains one.
+    """Another guide, corrected by a network.
+
+    `numpyro_bridges.scores.fit` trains one, `fit_tree` one for all branches of a tree.
 
     **Arguments:**
 
@@ -89,6 +91,8 @@ class ScoreGuide(AbstractGuide):
       dim)`: `t` from 0 to 1, `x` the displacement from the target and `v` the target, standardised,
       `theta` `(c,)` the standardised context, of size 0 if there is none. Its output in units of
       1/√(T ā), ā the mean of the diagonal of a at the target, times the weights of the space, is s.
+      On a tree the target is what the branch leads to, and 1 − t the time left until it is seen, as
+      a part of the tree's height.
     - `standard`: how its input is standardised.
     - `context`: `context(sde)`, the parameters that the network sees, `(c,)`; `None` if it was
       trained for one SDE.
