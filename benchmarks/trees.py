@@ -366,12 +366,13 @@ def learned(quick: bool):
         found = run(noise)
         line = {"guide": name, "mean": np.mean(found), "sd": np.std(found)}
         line |= {"path_s": seconds(lambda run=run, z=noise: run(z), 2) / len(noise)}
+        show(line | ({} if by is None else {"training_s": of_training}))
 
         def model(law=law):
             nb.sample("tips", law, obs=tips)
 
         kernel = nb.infer.FunctionSpaceHMC(model)
-        num_draws = 20 if quick else 300
+        num_draws = 20 if quick else 100
         mcmc = MCMC(
             kernel,
             num_warmup=num_draws // 2,
@@ -391,10 +392,9 @@ def learned(quick: bool):
         inner = inner[..., np.std(inner, axis=(0, 1)) > 0]
         ess = min(float(arviz.ess(inner[..., i])) for i in range(inner.shape[2]))
         a_draw = seconds_of_a_draw(kernel, mcmc.last_state)
-        line |= {"least_ess_of_ancestors": ess, "draws": 4 * num_draws, "draw_of_all_s": a_draw}
-        line |= {"ess_per_s": ess / num_draws / a_draw}
-        line |= {"accept": np.mean(mcmc.get_extra_fields()["accept_prob"])}
-        show(line | ({} if by is None else {"training_s": of_training}))
+        line = {"guide": name, "draws": 4 * num_draws, "draw_of_all_s": a_draw}
+        line |= {"least_ess_of_ancestors": ess, "ess_per_s": ess / num_draws / a_draw}
+        show(line | {"accept": np.mean(mcmc.get_extra_fields()["accept_prob"])})
 
 
 def show(line):
