@@ -247,7 +247,9 @@ class FrozenGuide(AbstractGuide):
     def _has_the_noise_of_the_end(self, sde: Displaced, reference: State) -> bool:
         """Whether every step has the σ of the end, times √dt."""
         other = self.auxiliary is not None or self.way is not None
-        euler = not sde.sde.has_exact_transition or isinstance(sde.sde, BrownianMotion)
+        # of displacements from a moving origin a linear process is one itself
+        process = sde.sde if isinstance(sde, Displaced) else sde
+        euler = isinstance(process, BrownianMotion) or not process.has_exact_transition
         return euler and not other and sde.is_autonomous(reference)
 
     def steps(self, sde: Displaced, reference: State, ts) -> AffineStep:
