@@ -190,6 +190,16 @@ PATHS = np.stack([SQUARE, 1.2 * SQUARE, 1.1 * SQUARE])
 LOG_WEIGHTS = np.linspace(-1.0, 1.0, 30)
 INTERVAL = {"t1": ("number", 1.0), "num_steps": ("count", 2), "t0": "number?", "ts": "array?"}
 GUIDED = INTERVAL | {"guide": "guide?"}
+LEARNED = {
+    "network": "function?",
+    "training": ("training?", TRAINING),
+    "draw": "function?",
+    "context": "function?",
+    "directory": "path?",
+    "progress": ("flag", False),
+    "watch": "function?",
+    "mesh": "mesh?",
+}
 FILE = Path("never") / "never.csv"
 
 
@@ -720,14 +730,7 @@ def table() -> dict[str, Row]:
             x0=("array", X),
             key=("key", KEY),
             method=("name", "residual"),
-            network="function?",
-            training=("training?", TRAINING),
-            draw="function?",
-            context="function?",
-            directory="path?",
-            progress=("flag", False),
-            watch="function?",
-            mesh="mesh?",
+            **LEARNED,
             **GUIDED | {"num_steps": ("count?", 2)},
         ),
         "scores.fit_tree": row(
@@ -736,14 +739,7 @@ def table() -> dict[str, Row]:
             law=("tree law", TREE_LAW),
             data=("array", np.zeros((3, len(X)))),
             key=("key", KEY),
-            network="function?",
-            training=("training?", TRAINING),
-            draw="function?",
-            context="function?",
-            directory="path?",
-            progress=("flag", False),
-            watch="function?",
-            mesh="mesh?",
+            **LEARNED,
         ),
         # data and drawings
         "datasets.mosquito_wings": row(

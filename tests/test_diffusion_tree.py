@@ -666,7 +666,8 @@ WIGGLY = nb.ScoreGuide(
     Standard(*map(jnp.asarray, (1.0, 0.8, 0.0, 1.0, np.zeros(0), np.zeros(0)))),
 )
 KINDS = {
-    "learned, inner node seen": (nb.InexactMatch(0.1), TREE, WIGGLY),
+    "inexact, inner node seen": (nb.InexactMatch(0.1), TREE, None),
+    "learned": (nb.InexactMatch(0.1), TREE, WIGGLY),
     "exact": (nb.ExactMatch(), nb.Tree.from_newick("((a:1,b:1.5):2,(c:3,d:.5):.3,g:2):.3;"), None),
     "some points": (nb.InexactMatch(0.1, PICK := np.eye(3)[[2, 0]]), TREE, nb.FrozenGuide()),
     "chain": (nb.InexactMatch(0.1), nb.Tree.chain([0.5, 0.7, 2.0]), None),
@@ -720,6 +721,27 @@ def test_the_way_back_to_the_noise(name, key):
     if isinstance(match, nb.ExactMatch):
         ends = [paths[walk.active.index(node), -1] for node in tree.observed]
         np.testing.assert_allclose(ends, seen, atol=1e-12)
+
+
+def test_a_network_of_zeros_changes_nothing(key):
+    """Path by path: what is told of a node, and how long until it is seen, reaches the guide that
+    is corrected.
+    """
+    silent = nb.ScoreGuide(WIGGLY.guide, lambda t, x, v, theta: 0 * x, WIGGLY.standard)
+
+    @jax.jit
+    def log_weights(key):
+        found = []
+        for guide in (WIGGLY.guide, silent, nb.DriftGuide(WIGGLY.guide), nb.DriftGuide(silent)):
+            law = nb.DiffusionTree(
+                FLOW, X0, nb.InexactMatch(0.1), tree=TREE, num_steps=3, guide=guide
+            )
+            z = jr.normal(key, law.noise_prior().shape())
+            found.append(law.given(z).log_prob(DATA))
+        return found
+
+    plain, same, drift, same_drift = log_weights(key)
+    np.testing.assert_allclose([same, same_drift], [plain, drift], rtol=1e-10)
 
 
 def test_steps_of_their_own(key):
@@ -860,7 +882,8 @@ def test_branch_lengths_have_priors():
     assert np.all(np.isfinite(mcmc.get_samples()["rates"]))
 
 
-def test_priors_on_everything_in_both_precisions():
+@pytest.mark.parametrize("learned", [False, True], ids=["geodesic", "learned"])
+def test_priors_on_everything_in_both_precisions(learned):
     """Kernel, errors of each tip, lengths, root and guide, inside a model under jit, branches with
     steps of their own.
 
@@ -881,6 +904,8 @@ def test_priors_on_everything_in_both_precisions():
         start = numpyro.sample("start", dist.Normal(circle, 0.1).to_event(2))
         correction = numpyro.sample("correction", dist.Uniform(0.0, 1.0))
         guide = nb.GeodesicGuide(correction, numpyro.sample("end_weight", dist.Uniform(0.0, 0.5)))
+        if learned:
+            guide = nb.ScoreGuide(guide, WIGGLY.network, WIGGLY.standard)
         flow = nb.KunitaFlow(
             space, nb.GaussianKernel(amplitude, length_scale), noise=nb.LandmarkNoise(1e-5)
         )

@@ -1026,10 +1026,6 @@ def test_the_sine_bridge(method):
     assert 0 < error < 0.1 * gain and abs(gain - gained) < 4 * np.hypot(error, own)
 
 
-if __name__ == "__main__":
-    long_training(sys.argv[1])
-
-
 # Trees.
 
 SPLITS = nb.Tree.from_newick("((a:.5,b:.7):.4,c:.6);")
@@ -1095,3 +1091,7 @@ def test_several_trees_at_once_are_refused():
     law = pulled(3.0).expand((2,))
     with pytest.raises(ValueError, match=r"`law` must be of one tree; it has batch shape \(2,\)"):
         nb.scores.fit_tree(law, AT_TIPS, key=jr.key(0))
+
+
+if __name__ == "__main__":
+    long_training(sys.argv[1])

@@ -229,19 +229,15 @@ class FrozenGuide(AbstractGuide):
         return smoothed(self, sde, seen, observed, reference, ts, start)
 
     def plan(self, sde, seen, reference, ts, steps: AffineStep | None = None):
-        if steps is not None:
-            return _FrozenPlan(backward_filter(steps, seen), seen.exact)
-        steps = self.steps(sde, reference, ts)
-        sigma, a = sde.noise(ts[-1], reference)
-        is_number = steps.operator.ndim == 1  # the first axis is that of the steps
-        if (
-            is_number
-            and self._has_the_noise_of_the_end(sde, reference)
-            and is_low_rank(sigma, seen)
-        ):
-            # all the time left is bridged by the covariance of the end: no matrix of all values
-            end = _End(jnp.ones((), reference.dtype), a)
-            return accumulated_plan(steps, seen, reference, ts, sigma, end)
+        if steps is None:
+            steps = self.steps(sde, reference, ts)
+            is_number = steps.operator.ndim == 1  # the first axis is that of the steps
+            if is_number and self._has_the_noise_of_the_end(sde, reference):
+                sigma, a = sde.noise(ts[-1], reference)
+                if is_low_rank(sigma, seen):
+                    # the covariance of the end bridges all the time left: no matrix of all values
+                    end = _End(jnp.ones((), reference.dtype), a)
+                    return accumulated_plan(steps, seen, reference, ts, sigma, end)
         return _FrozenPlan(backward_filter(steps, seen), seen.exact)
 
     def _has_the_noise_of_the_end(self, sde: Displaced, reference: State) -> bool:
@@ -538,6 +534,10 @@ class DriftGuide(AbstractGuide):
         plan = self.guide.plan(sde, seen, reference, ts)
         return _DriftPlan(plan.steps, plan)
 
+    def whole(self, plan):
+        assert isinstance(plan, _DriftPlan)
+        return _DriftPlan(plan.steps, self.guide.whole(plan.wrapped))
+
     def auxiliary_process(self, sde, reference, t1):
         return self.guide.auxiliary_process(sde, reference, t1)
 
@@ -545,6 +545,9 @@ class DriftGuide(AbstractGuide):
 class _DriftPlan(AbstractPlan):
     steps: Any
     wrapped: AbstractPlan
+
+    def bare(self):
+        return _DriftPlan(self.steps, self.wrapped.bare())
 
     def steer(self, step, transition, dt, x, observed):
         # The mean of the other's step, with the noise as it was: B = I.

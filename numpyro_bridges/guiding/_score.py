@@ -163,7 +163,7 @@ class ScoreGuide(AbstractGuide):
         return self.guide.follows(sde, seen, reference)
 
     def plan(self, sde, seen, reference, ts, *beyond):
-        network, context = self.programs
+        _, context = self.programs
         # `beyond`, the time from the end until the state is seen, is for a base that follows
         base = self.guide.plan(sde, seen, reference, ts, *beyond)
         left = ts[-1] + sum(beyond) - ts[:-1]
@@ -180,15 +180,19 @@ class ScoreGuide(AbstractGuide):
         v = reference.reshape(n, -1)
         target = self.standard.target(v + sde.origin.reshape(v.shape), pooled)
         inputs = v, target, theta
-        network = self.network if network is None else network
+        network = self._program
         return ScorePlan((base.steps, left), base, network, self.held, self.standard, unit, inputs)
 
     def whole(self, plan):
         assert isinstance(plan, ScorePlan)
-        network, _ = self.programs
-        network = self.network if network is None else network
         base = self.guide.whole(plan.base)
-        return replace(plan, base=base, network=network, held=self.held)
+        return replace(plan, base=base, network=self._program, held=self.held)
+
+    @property
+    def _program(self) -> Callable:
+        """The network as a bridge holds it, or as it was given."""
+        network, _ = self.programs
+        return self.network if network is None else network
 
 
 class ScorePlan(AbstractPlan):

@@ -160,15 +160,10 @@ def fit(
     bridge = GuidedBridge(
         sde, condition, x0=x0, t1=t1, t0=t0, num_steps=num_steps, ts=ts, guide=guide
     )
-    require(
-        bridge.flat is None,
-        "`condition` is known by its density, for which states of several columns are flattened: "
-        "a network of such states cannot be learned. Fit one for an `InexactMatch` near it, or "
-        "use the default guide.",
-    )
-    bridge = _better(bridge, key) if guide is None else bridge
+    _refuse_flattened(bridge.flat is not None, "`condition`")
     training, progress, folder = _checked_settings(training, progress, directory, mesh)
     _check_functions(context, network, watch, draw, "(sde, condition, x0)")
+    bridge = _better(bridge, key) if guide is None else bridge
     key_network, key_pilot, key_train = jr.split(key, 3)
 
     def draw_bridge(key):
@@ -221,9 +216,9 @@ def fit_tree(
 
     - `law`: a `DiffusionTree`, whose guide is the one that is corrected. `data`: as `obs=` takes
       them.
-    - `draw`: `draw(key)` gives `(law, data)` on a tree of the same topology, for a guide that
-      serves many: other parameters, lengths or data. `context(sde)`, `(c,)`, are the parameters
-      that the network is told.
+    - `draw`: `draw(key)` gives `(law, data)` on a tree of the same topology and with the same
+      guide, for one that serves many: other parameters, lengths or data. `context(sde)`, `(c,)`,
+      are the parameters that the network is told.
     - `network`, `training`, `directory`, `progress`, `watch`, `mesh`: as for `fit`. The networks
       that it has by default are those of `fit`.
 
@@ -237,12 +232,7 @@ def fit_tree(
     training, progress, folder = _checked_settings(training, progress, directory, mesh)
     _check_functions(context, network, watch, draw, "(law, data)")
     tree = law.problem(data, "data")
-    require(
-        tree.x0.ndim == law.parts["x0"].ndim,
-        "`law` has a match known by its density, for which states of several columns are "
-        "flattened: a network of such states cannot be learned. Fit one for an `InexactMatch` near "
-        "it, or use the default guide.",
-    )
+    _refuse_flattened(tree.x0.ndim != law.parts["x0"].ndim, "the match of `law`")
     key_network, key_pilot, key_train = jr.split(key, 3)
 
     def draw_tree(key):
@@ -263,6 +253,15 @@ def fit_tree(
     amortised = draw is not None
     problem = Problem(draw_tree, amortised, start, training, train, mesh, knows_ess=False)
     return residual(problem, key_train)
+
+
+def _refuse_flattened(flat: bool, what: str) -> None:
+    require(
+        not flat,
+        f"{what} is known by its density, for which states of several columns are flattened: a "
+        "network of such states cannot be learned. Fit one for an `InexactMatch` near it, or use "
+        "the default guide.",
+    )
 
 
 def _checked_settings(training, progress, directory, mesh) -> tuple[Training, bool, Path | None]:
