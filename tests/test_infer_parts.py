@@ -75,7 +75,7 @@ POTENTIALS = [(badly_scaled, [3.0, -1.0, 2.0]), (bent, [-1.2, 1.0, 0.3]), (bent,
 @pytest.mark.parametrize("potential, start", POTENTIALS)
 def test_laplace(potential, start):
     """The mode as SciPy finds it, and the inverse Hessian there, to a factor: a first mass matrix."""
-    found = jax.jit(lambda x: laplace(potential, x))(jnp.asarray(start))
+    found = jax.jit(lambda x: laplace(potential, x)[0])(jnp.asarray(start))
     mode = scipy.optimize.minimize(
         potential, np.ones(3), jac=jax.grad(potential), method="BFGS", tol=1e-9
     ).x
@@ -97,7 +97,7 @@ def test_laplace_in_single_precision():
 
     with jax.enable_x64(False):
         starts = np.random.default_rng(0).normal([2000.0, 0.5], 0.3, (20, 2)).astype(np.float32)
-        found = jax.jit(jax.vmap(lambda x: laplace(potential, x)))(starts)
+        found = jax.jit(jax.vmap(lambda x: laplace(potential, x)[0]))(starts)
     mode = scipy.optimize.minimize(
         potential, np.array([2000.0, 0.0]), jac=jax.grad(potential), method="BFGS"
     ).x
@@ -110,8 +110,46 @@ def test_laplace_in_single_precision():
         assert np.all((ratios > 1 / 4) & (ratios < 4)), ratios
 
 
+def test_laplace_visits_starts():
+    """Value and gradient where chains start, for draws from the very reference that is found."""
+    draws = RNG.normal(size=(4, 3))
+    noises = jnp.asarray(RNG.normal(size=(4, 2)))
+
+    def potential(x, noise):
+        return bent(x) + jnp.sum(jnp.cos(noise + x[:2]))
+
+    def visit(reference):
+        return jax.vmap(reference.colour)(draws), noises
+
+    still = jnp.zeros(2)
+    first = jnp.array([-1.2, 1.0, 0.3])
+    alone, none = jax.jit(lambda: laplace(potential, first, still))()
+    found, (values, slopes) = jax.jit(lambda: laplace(potential, first, still, visit=visit))()
+    assert none is None
+    np.testing.assert_allclose(found.mean, alone.mean, rtol=1e-12)
+    np.testing.assert_allclose(found.scale, alone.scale, rtol=1e-12)
+    points = visit(found)
+    expected = jax.vmap(jax.value_and_grad(potential, (0, 1)))(*points)
+    for a, b in zip(jax.tree.leaves((values, slopes)), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10)
+
+
+def test_laplace_visits_where_there_is_nothing_to_search():
+    def potential(x, noise):
+        return jnp.sum(noise**2) + jnp.sum(x)
+
+    noises = jnp.array([[1.0], [2.0], [3.0]])
+    nothing = jnp.zeros(0)
+    found, (values, (_, forces)) = jax.jit(
+        lambda: laplace(potential, nothing, noises[0], visit=lambda _: (jnp.zeros((3, 0)), noises))
+    )()
+    assert found.mean.size == 0
+    np.testing.assert_allclose(values, [1.0, 4.0, 9.0])
+    np.testing.assert_allclose(forces, 2 * noises)
+
+
 def test_laplace_without_a_start():
-    found = jax.jit(lambda x: laplace(bent, x))(jnp.array([2.0, 0.0, 1.0]))
+    found = jax.jit(lambda x: laplace(bent, x)[0])(jnp.array([2.0, 0.0, 1.0]))
     assert np.array_equal(found.mean, [2.0, 0.0, 1.0]) and np.array_equal(found.scale, np.eye(3))
 
 

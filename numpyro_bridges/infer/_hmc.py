@@ -110,13 +110,15 @@ class FunctionSpaceHMC(AbstractBridgeKernel):
         self._jitter = known_number(jitter, "jitter", *PROPORTION_OR_0)
         self._max_num_steps = positive_integer(max_num_steps, "max_num_steps")
 
+    _follows_misfit = True
+
     def get_diagnostics_str(self, state):
         step = float(state.adapt_state.step_size)
         steps = int(state.num_steps)
         return f"{steps} steps of size {step:.2e}. acc. prob={float(state.mean_accept_prob):.2f}"
 
-    def _init_one(self, key, z, reference, model_args, model_kwargs):
-        phi, gradient = jax.value_and_grad(self._misfit)(z, model_args, model_kwargs)
+    def _init_one(self, key, z, energies, reference, model_args, model_kwargs):
+        phi, gradient = energies
         least, _ = self._step_bounds
         step = jnp.maximum(jnp.asarray(self._step_size, phi.dtype), least)
         adapt = AdaptState(*start_step_size(step), start_windows(reference))

@@ -75,9 +75,14 @@ class AbstractBridgeKernel(MCMCKernel):
         self._blocks: dict[str, NoiseBlocks | None] = {}
         self._owners: dict[str, str] | None = None
 
+    _follows_misfit = False
+    """Whether `_init_one` needs Φ and its gradient."""
+
     @abstractmethod
-    def _init_one(self, key, z: Sites, reference: Reference, model_args, model_kwargs):
-        """The state of one chain that starts at z."""
+    def _init_one(self, key, z: Sites, energies, reference: Reference, model_args, model_kwargs):
+        """The state of one chain that starts at z. `energies`: Φ and its gradient there, where they
+        were asked for.
+        """
 
     @abstractmethod
     def _sample_one(self, state, still, model_args, model_kwargs):
@@ -114,18 +119,29 @@ class AbstractBridgeKernel(MCMCKernel):
             constrained = GIBBS_SITES_KWARG in model_kwargs
             init_params = _starts(init_params, sites, constrained, num_chains) or None
 
-        def one(key, init_params, reference):
-            key, key_start, key_reference = jr.split(key, 3)
-            z = self._start(key_start, model_args, model_kwargs) | (init_params or {})
-            if init_params is None:
-                z = self._drawn(key_reference, z, reference)
-            state = self._init_one(key, z, reference, model_args, model_kwargs)
+        def one(key, z, energies, reference):
+            state = self._init_one(key, z, energies, reference, model_args, model_kwargs)
             return _sealed(state, _seal_of(model_args, model_kwargs))
 
         def start(keys, init_params):
-            first = init_params if num_chains is None else jax.tree.map(lambda x: x[0], init_params)
-            reference = self._laplace(first, model_args, model_kwargs)  # one search, for all chains
-            return over_chains(partial(one, reference=reference))(keys, init_params)
+            if num_chains is None:
+                keys, init_params = jax.tree.map(lambda x: x[None], (keys, init_params))
+            keys, keys_start, keys_reference = jax.vmap(partial(jr.split, num=3), out_axes=1)(keys)
+            begins = jax.vmap(lambda key: self._start(key, model_args, model_kwargs))(keys_start)
+            begins |= init_params or {}
+
+            def starts(reference):
+                if init_params is not None:
+                    return begins
+                return jax.vmap(self._drawn, (0, 0, None))(keys_reference, begins, reference)
+
+            # one search, for all chains
+            first = init_params and jax.tree.map(lambda x: x[0], init_params)
+            reference, energies = self._laplace(first, model_args, model_kwargs, starts)
+            chains = keys, starts(reference), energies
+            if num_chains is None:
+                chains = jax.tree.map(lambda x: x[0], chains)
+            return over_chains(partial(one, reference=reference))(*chains)
 
         if num_chains is not None:
             over_chains = partial(spread, mesh=mesh_for(num_chains, "`num_chains`", self._mesh))
@@ -269,15 +285,25 @@ class AbstractBridgeKernel(MCMCKernel):
         sites = self._latent(key, self._init_strategy, model_args, model_kwargs)
         return {k: biject_to(site["fn"].support).inv(site["value"]) for k, site in sites.items()}
 
-    def _laplace(self, init_params, model_args, model_kwargs) -> Reference:
+    def _laplace(self, init_params, model_args, model_kwargs, starts=None):
         """A Laplace approximation of the parameters' posterior: one search, whatever the keys of
-        the chains.
+        the chains. With Φ and its gradient at `starts` of it, z of all chains, where the kernel
+        follows them.
         """
         z = self._start(jr.key(0), model_args, model_kwargs) | (init_params or {})
         theta, noise, unravel = self._parts(z)
-        return laplace(
-            lambda theta: self._misfit(unravel(theta) | noise, model_args, model_kwargs), theta
-        )
+
+        def potential(theta, noise):
+            return self._misfit(unravel(theta) | noise, model_args, model_kwargs)
+
+        visit = None
+        if self._follows_misfit and starts is not None:
+            visit = lambda found: jax.vmap(lambda z: self._parts(z)[:2])(starts(found))  # noqa: E731
+        reference, found = laplace(potential, theta, noise, visit=visit)
+        if found is None:
+            return reference, None
+        values, (slopes, forces) = found
+        return reference, (values, jax.vmap(unravel)(slopes) | forces)
 
     def _drawn(self, key, z, reference: Reference) -> Sites:
         """z with parameters from the reference."""

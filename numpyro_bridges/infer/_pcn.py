@@ -107,7 +107,7 @@ class AbstractPCN(AbstractBridgeKernel):
         angle = float(jnp.mean(angles))
         return f"mean angle {angle:.2f}. acc. prob={float(state.mean_accept_prob):.2f}"
 
-    def _init_one(self, key, z, reference, model_args, model_kwargs):
+    def _init_one(self, key, z, energies, reference, model_args, model_kwargs):
         parameters = sorted(set(z) - set(self._noise))
         require(
             not parameters,

@@ -127,7 +127,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
             key_start, key_noise = jr.split(key)
             z = self._start(key_start, model_args, model_kwargs)
             _, noise, unravel = self._parts(z)
-            reference = self._laplace(None, model_args, model_kwargs)
+            reference, _ = self._laplace(None, model_args, model_kwargs)
             self._owners = driven_by(self._model, model_args, model_kwargs, z, self._noise)
 
             def one(key):
@@ -141,7 +141,7 @@ class AbstractPseudoMarginal(AbstractBridgeKernel):
         # a key of its own: N is a setting of the kernel, the same for every chain
         return log_weights(jr.key(0))
 
-    def _init_one(self, key, z, reference, model_args, model_kwargs):
+    def _init_one(self, key, z, energies, reference, model_args, model_kwargs):
         key, key_particles, key_pick = jr.split(key, 3)
         theta, noise, unravel = self._parts(z)
         require(

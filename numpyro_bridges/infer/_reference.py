@@ -39,15 +39,57 @@ class Reference(NamedTuple):
         return solve_triangular(self.scale.T, gradient, lower=False) if gradient.size else gradient
 
 
-def laplace(potential, theta: Array) -> Reference:
-    """Mode and inverse Hessian of exp(-potential) by BFGS from θ; N(θ, I) where that fails."""
-    start = Reference(theta, jnp.eye(theta.size, dtype=theta.dtype))
-    # a model of noise alone
-    if not theta.size:
-        return start
+def laplace(potential, theta: Array, *others, visit=None):
+    """Mode and inverse Hessian of exp(-potential(θ, *others)) by BFGS from θ, with the others as
+    they are; N(θ, I) where that fails.
+
+    `visit`: a function of that reference which gives points `(θ, *others)`, stacked, at which value
+    and gradient are wanted as well. They are evaluated one by one, in the loop of the search, which
+    holds the only copy of the gradient: compiling it is most of what the start of a chain takes.
+
+    Returns the reference, and values and gradients of the visits, stacked; None without any.
+    """
     # the Hessian as BFGS has it: differentiation would compile derivatives of the gradient
-    mode, inverse_hessian = _bfgs(jax.value_and_grad(potential), theta)
-    return if_finite(Reference(mode, jnp.linalg.cholesky(inverse_hessian)), start)
+    value_and_grad = jax.value_and_grad(potential, tuple(range(1 + len(others))))
+
+    start = Reference(theta, jnp.eye(theta.size, dtype=theta.dtype))
+
+    def found_by(search: _Search) -> Reference:
+        # a model of noise alone
+        if not theta.size:
+            return start
+        mode = jnp.where(jnp.isfinite(search.value), search.x, jnp.nan)
+        return if_finite(Reference(mode, jnp.linalg.cholesky(search.inverse)), start)
+
+    num_visits = 0 if visit is None else len(visit(start)[0])
+    if not theta.size and not num_visits:
+        return start, None
+
+    def go_on(carry):
+        search, i, _ = carry
+        return _goes_on(search) | (i < num_visits)
+
+    def body(carry):
+        search, i, found = carry
+        searching = _goes_on(search)
+        point = (search.x + search.step, *others)
+        if visit is not None:
+            visited = jax.tree.map(lambda x: x[i], visit(found_by(search)))
+            point = choose(searching, point, visited)
+        value, gradient = value_and_grad(*point)
+        search = choose(searching, _updated(search, value, gradient[0]), search)
+        if visit is not None:
+            place = jnp.where(searching, num_visits, i)  # out of bounds while it searches
+            found = jax.tree.map(
+                lambda all, x: all.at[place].set(x, mode="drop"), found, (value, gradient)
+            )
+        return search, jnp.where(searching, i, i + 1), found
+
+    one = (jnp.zeros((), theta.dtype), (theta, *others))
+    found = jax.tree.map(lambda x: jnp.zeros((num_visits, *x.shape), x.dtype), one)
+    first = _start_search(theta), jnp.zeros((), int), found
+    search, _, found = jax.lax.while_loop(go_on, body, first)
+    return found_by(search), None if visit is None else found
 
 
 _MAX_EVALUATIONS = 100
@@ -57,7 +99,11 @@ _ROUNDING = 100.0
 
 
 class _Search(NamedTuple):
-    """The best x so far, with value, slope and inverse Hessian; x + step is tried next."""
+    """A minimum by BFGS with backtracking (Nocedal and Wright, 2006, algorithm 6.1): the best x so
+    far, with value, slope and inverse Hessian; x + step is tried next.
+
+    `jax.scipy.optimize.minimize` evaluates the function at six places of its program.
+    """
 
     x: Array
     value: Array
@@ -67,49 +113,50 @@ class _Search(NamedTuple):
     num_evaluations: Array
 
 
-def _bfgs(value_and_grad, x: Array) -> tuple[Array, Array]:
-    """A minimum and the inverse Hessian by BFGS with backtracking (Nocedal and Wright, 2006,
-    algorithm 6.1).
-
-    One loop evaluates the function at one place. `jax.scipy.optimize.minimize` holds six copies of
-    it, and compiling them is most of what the start of a chain takes.
-    """
-
-    rounding = _ROUNDING * jnp.finfo(x.dtype).eps
-
-    def go_on(search: _Search):
-        # a step that promises less than rounding would fill the inverse Hessian with noise
-        promised = -search.slope @ search.step
-        steep = jnp.max(jnp.abs(search.slope)) > _GRADIENT_TOLERANCE
-        moves = steep & (promised > rounding * (1 + jnp.abs(search.value)))
-        # before the first evaluation the slope is 0, and means nothing
-        moves = moves | (search.num_evaluations == 0)
-        return moves & (search.num_evaluations < _MAX_EVALUATIONS)
-
-    def body(search: _Search):
-        x, value, slope, inverse, step, count = search
-        new_value, new_slope = value_and_grad(x + step)
-        # Armijo's rule; a NaN is no descent, so that the step is halved there too
-        enough = new_value <= value + 1e-4 * slope @ step
-        good = enough & jnp.all(jnp.isfinite(new_slope))
-        updated = _inverse_update(inverse, step, new_slope - slope)
-        inverse = choose(good & (count > 0), updated, inverse)
-        x, value, slope = choose(good, (x + step, new_value, new_slope), (x, value, slope))
-        full = -inverse @ slope
-        # The first direction is the gradient, whose length is in no unit of x: at most 1. Then at
-        # most twice the step before: along directions that no step has tried the inverse Hessian is
-        # a guess.
-        most = jnp.where(count == 0, 1.0, 2 * jnp.linalg.norm(step))
-        length = jnp.minimum(1.0, most / jnp.linalg.norm(full))
-        step = choose(good, length * full, 0.5 * step)
-        return _Search(x, value, slope, inverse, step, count + 1)
-
+def _start_search(x: Array) -> _Search:
     # the start has the value ∞ and the step 0: the first evaluation is of x itself, and accepted
     infinite = jnp.asarray(jnp.inf, x.dtype)
     none = jnp.zeros_like(x)
-    start = _Search(x, infinite, none, jnp.eye(x.size, dtype=x.dtype), none, jnp.zeros((), int))
-    found = jax.lax.while_loop(go_on, body, start)
-    return jnp.where(jnp.isfinite(found.value), found.x, jnp.nan), found.inverse
+    return _Search(x, infinite, none, jnp.eye(x.size, dtype=x.dtype), none, jnp.zeros((), int))
+
+
+def _goes_on(search: _Search) -> Array:
+    if not search.x.size:
+        return jnp.array(False)
+    # a step that promises less than rounding would fill the inverse Hessian with noise
+    rounding = _ROUNDING * jnp.finfo(search.x.dtype).eps
+    promised = -search.slope @ search.step
+    steep = jnp.max(jnp.abs(search.slope)) > _GRADIENT_TOLERANCE
+    moves = steep & (promised > rounding * (1 + jnp.abs(search.value)))
+    # before the first evaluation the slope is 0, and means nothing
+    moves = moves | (search.num_evaluations == 0)
+    return moves & (search.num_evaluations < _MAX_EVALUATIONS)
+
+
+def _updated(search: _Search, new_value: Array, new_slope: Array) -> _Search:
+    """After the evaluation at x + step."""
+    x, value, slope, inverse, step, count = search
+    # Armijo's rule; a NaN is no descent, so that the step is halved there too
+    enough = new_value <= value + 1e-4 * slope @ step
+    good = enough & jnp.all(jnp.isfinite(new_slope))
+    updated = _inverse_update(inverse, step, new_slope - slope)
+    inverse = choose(good & (count > 0), updated, inverse)
+    x, value, slope = choose(good, (x + step, new_value, new_slope), (x, value, slope))
+    full = -inverse @ slope
+    # The first direction is the gradient, whose length is in no unit of x: at most 1. Then at most
+    # twice the step before: along directions that no step has tried the inverse Hessian is a guess.
+    most = jnp.where(count == 0, 1.0, 2 * jnp.linalg.norm(step))
+    length = jnp.minimum(1.0, most / jnp.linalg.norm(full))
+    step = choose(good, length * full, _shorter(search, new_value) * step)
+    return _Search(x, value, slope, inverse, step, count + 1)
+
+
+def _shorter(search: _Search, new_value: Array) -> Array:
+    """The part of a step to be tried next: where the parabola through both values is least."""
+    slope = search.slope @ search.step
+    part = -0.5 * slope / (new_value - search.value - slope)
+    # half, where there is none
+    return jnp.clip(jnp.where(jnp.isfinite(part), part, 0.5), 0.1, 0.5)
 
 
 def _inverse_update(inverse: Array, step: Array, change: Array) -> Array:
