@@ -170,6 +170,36 @@ def solve_lower(C: Structured, x: State, transposed: bool = False) -> State:
     return out.reshape(x.shape)
 
 
+def solve_positive(S: Structured, x: State, factor: Structured | None = None) -> State:
+    """S⁻¹ x for a positive definite S, with the derivative of a solution.
+
+    That of the factorisation takes two solves with all columns of S, and this one with those of x.
+    `factor`: that of S, if there is one already; no derivative goes through it.
+    """
+    if S.ndim < 2:
+        return solve_lower(S, x)
+    C = lax.stop_gradient(cholesky(lax.stop_gradient(S)) if factor is None else factor)
+
+    def by_factor(_, x):
+        return solve_lower(C, solve_lower(C, x), transposed=True)
+
+    return lax.custom_linear_solve(lambda x: apply(S, x), x, by_factor, symmetric=True)
+
+
+@jax.custom_jvp
+def half_square(S: Array, x: Array) -> Array:
+    """½ Σ xᵀ S⁻¹ x over the columns of x, for a matrix S, with derivatives that take one solve."""
+    return 0.5 * jnp.sum(x * solve_positive(S, x))
+
+
+@half_square.defjvp
+def _(primals, tangents):
+    S, x = primals
+    dS, dx = tangents
+    y = solve_positive(S, x)
+    return 0.5 * jnp.sum(x * y), jnp.sum(y * dx) - 0.5 * jnp.sum(y * (dS @ y))
+
+
 def log_diagonal(C: Structured, m: int):
     """log|C| of a triangular C that acts on `m` rows."""
     if C.ndim == 0:

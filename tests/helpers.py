@@ -203,9 +203,12 @@ class Problem:
         """By how much the Hamiltonian path of the receding momentum misses v: one midpoint step to
         the end.
         """
-        Lam, s, S = self.forecast(k, x, k)
+        Lam, s, M = self.forecast(k + 1, x, k)
         t, left, L = self.ts[k], self.ts[-1] - self.ts[k], self.condition.L
-        r = v - Lam @ x - s
+        # its momentum is that of the step's own forecast
+        m, sigma = self.process.step(t, self.ts[k + 1], x)
+        S = M + Lam @ sigma @ sigma.T @ Lam.T
+        r = v - Lam @ m - s
         momentum = np.linalg.solve(S, r)
 
         def energy(x, p):

@@ -1,4 +1,4 @@
-"""The derivative by hand of the guided step's hot line, against finite differences."""
+"""Derivatives by hand in the guided step, against finite differences and plain solves."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from numpyro_bridges._linalg import half_square, solve_positive
 from numpyro_bridges.guiding._drive import drive
+from numpyro_bridges.guiding._few_noises import Errors, LowRank, NoiseSteering
 
 pytestmark = pytest.mark.usefixtures("compile_quickly")
 
@@ -43,3 +45,66 @@ def test_derivative_of_a_batch(key, over):
     each = [jax.grad(f)(shared, one) for one in several]
     for gradient, *others in zip(found, *each, strict=True):
         np.testing.assert_allclose(gradient, sum(others), rtol=1e-9, atol=1e-10)
+
+
+def positive(X):
+    return X @ X.T + jnp.eye(len(X))
+
+
+def dense(sd, F, end_scale, G, scale):
+    return jnp.diag(sd**2) + end_scale * F @ F.T + scale * G @ G.T
+
+
+def low_rank(sd, F, end_scale, G, scale):
+    return LowRank(Errors.of(sd, F), end_scale, G, scale)
+
+
+def steering(sd, F, end_scale, G, scale, step):
+    return NoiseSteering(low_rank(sd, F, end_scale, G, scale), step, jnp.zeros((6, 2)))
+
+
+# What is solved by factors that carry no derivative, and the same by a dense solve.
+SOLUTIONS = {
+    "positive": (lambda X, r: solve_positive(positive(X), r), "X r"),
+    "positive, dense": (lambda X, r: jnp.linalg.solve(positive(X), r), "X r"),
+    "square": (lambda X, r: half_square(positive(X), r), "X r"),
+    "square, dense": (lambda X, r: 0.5 * jnp.sum(r * jnp.linalg.solve(positive(X), r)), "X r"),
+    "low rank": (lambda *a: low_rank(*a[:-1]).solve(a[-1]), "sd F l G k v"),
+    "low rank, dense": (lambda *a: jnp.linalg.solve(dense(*a[:-1]), a[-1]), "sd F l G k v"),
+    "step": (lambda *a: steering(*a[:-1]).solve(a[-1]), "sd F l G k s v"),
+    "step, dense": (
+        lambda *a: jnp.linalg.solve(dense(*a[:4], a[4] + a[5] ** 2), a[6]),
+        "sd F l G k s v",
+    ),
+    "information": (lambda *a: low_rank(*a).information(), "sd F l G k"),
+    "information, dense": (
+        lambda *a: a[3].T @ jnp.linalg.solve(dense(*a), a[3]),
+        "sd F l G k",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ["positive", "square", "low rank", "step", "information"])
+def test_derivatives_of_solutions(key, name):
+    """Values, gradients and second derivatives in all that the matrix is made of."""
+    f, letters = SOLUTIONS[name]
+    g, _ = SOLUTIONS[f"{name}, dense"]
+    rng = np.random.default_rng(0)
+    shapes = {"X": (3, 3), "r": (3, 2), "F": (6, 2), "G": (6, 2), "v": (6, 2), "sd": (6,)}
+    shapes |= {"l": (), "k": (), "s": ()}
+    values = {name: jnp.asarray(rng.normal(size=shape)) for name, shape in shapes.items()}
+    values |= {name: jnp.abs(values[name]) + 0.5 for name in ("sd", "l", "k", "s")}
+    arguments = tuple(values[letter] for letter in letters.split())
+    direction = tuple(jnp.asarray(rng.normal(size=jnp.shape(a))) for a in arguments)
+
+    def derivatives(f):
+        def scalar(*a):
+            return jnp.sum(jnp.sin(f(*a)))
+
+        every = tuple(range(len(arguments)))
+        slope = jax.grad(scalar, every)
+        return f(*arguments), *jax.jvp(slope, arguments, direction)
+
+    found, expected = jax.jit(lambda: (derivatives(f), derivatives(g)))()
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10)

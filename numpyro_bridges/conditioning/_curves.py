@@ -188,7 +188,7 @@ def _edges(points: Points, closed_curve: bool) -> tuple[Points, Points]:
 
 
 def _gaussian(x: Points, y: Points, scale) -> Float[Array, "n m"]:
-    return jnp.exp(-squared_distances(x, y) / scale.astype(x.dtype) ** 2)
+    return jnp.exp(-squared_distances(x, y, scale))
 
 
 def _count(num_points: int | None) -> int | None:

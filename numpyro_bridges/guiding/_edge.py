@@ -23,7 +23,9 @@ from ._steering import GaussianSteering
 from ._step import GridNoise, GuidedStep, GuidedTerm
 
 _MAX_KEPT = 64
-"""Largest n whose Cholesky factors, three n × n matrices a step, are kept for the reverse pass."""
+"""Most noises with which the Cholesky factors of a step, some matrices of that size, are kept for
+the reverse pass.
+"""
 
 
 def travel(
@@ -38,7 +40,7 @@ def travel(
 
     The plan has an entry for each of the times.
     """
-    few = x0.shape[0] <= _MAX_KEPT
+    few = noise.shape[1] <= _MAX_KEPT
 
     # A step is computed again in the reverse pass, so that memory does not grow by all that it
     # makes, but for small Cholesky factors, its dearest part. `prevent_cse` guards against a

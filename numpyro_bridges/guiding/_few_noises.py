@@ -12,8 +12,12 @@ E = D + λ F Fᵀ, D diagonal. With N Nᵀ = I + λ Fᵀ D⁻¹ F
     E⁻¹ = D⁻¹ − λ D⁻¹ F N⁻ᵀ N⁻¹ Fᵀ D⁻¹                                          (Woodbury).
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from .._linalg import (
@@ -24,6 +28,7 @@ from .._linalg import (
     congruence,
     log_diagonal,
     solve_lower,
+    solve_positive,
     transpose,
 )
 from .._types import Noise, State, Structured
@@ -55,6 +60,38 @@ class Errors(eqx.Module):
         return cls(sd, factor, factor.T @ factor)
 
 
+@jax.custom_jvp
+def _schur(A: Array, scale: Array, B: Array, T: "_Positive") -> Array:
+    """A − λ Bᵀ T⁻¹ B, symmetric, with a derivative that needs none of a factorisation."""
+    across = solve_lower(T.factor, B)
+    return A - scale * (across.T @ across)
+
+
+@_schur.defjvp
+def _(primals, tangents):
+    _, scale, B, T = primals
+    dA, dscale, dB, dT = tangents
+    Y = T.solve(B)
+    half = scale * (Y.T @ dB) + 0.5 * dscale * (Y.T @ B)
+    return _schur(*primals), dA - half - half.T + scale * (Y.T @ dT.matrix @ Y)
+
+
+class _Positive(eqx.Module):
+    """A positive definite matrix I + S beside its factor, by which it is solved."""
+
+    matrix: Float[Array, "k k"]
+    factor: Float[Array, "k k"]
+
+    @classmethod
+    def plus_identity(cls, S: Float[Array, "k k"]) -> "_Positive":
+        matrix = add(S, jnp.ones((), S.dtype))
+        # solutions have derivatives of their own, for which the factor is a constant
+        return cls(matrix, cholesky(lax.stop_gradient(matrix)))
+
+    def solve(self, x: State) -> State:
+        return solve_positive(self.matrix, x, self.factor)
+
+
 class LowRank(eqx.Module):
     """The covariance E + κ G Gᵀ of what is observed."""
 
@@ -65,12 +102,12 @@ class LowRank(eqx.Module):
     """D^{-½} G."""
     scale: Float[Array, ""]
     """κ."""
-    across: Float[Array, "q k"] | None
-    """N⁻¹ Fᵀ D⁻¹ G."""
+    end: _Positive | None
+    """I + λ Fᵀ D⁻¹ F = N Nᵀ."""
     gram: Float[Array, "k k"]
     """C."""
-    root: Float[Array, "k k"]
-    """Of I + κ C."""
+    whole: _Positive
+    """I + κ C."""
 
     def __init__(self, errors: Errors, end_scale, factor: Float[Array, "m k"], scale):
         self.errors = errors
@@ -79,55 +116,58 @@ class LowRank(eqx.Module):
         # All is in units of the errors, D^{-½} on the left of every m-vector, so that E is the
         # identity but for F.
         self.factor = solve_lower(errors.sd, factor)
-        self.across = None
+        self.end = None
         self.gram = self.factor.T @ self.factor
-        if errors.factor is not None:
+        if errors.factor is not None and errors.gram is not None:
             # C = Gᵀ D⁻¹ G − λ (N⁻¹ Fᵀ D⁻¹ G)ᵀ (N⁻¹ Fᵀ D⁻¹ G)
-            self.across = solve_lower(self._end_root, errors.factor.T @ self.factor)
-            self.gram = self.gram - end_scale * (self.across.T @ self.across)
-        self.root = self._plus_identity(scale * self.gram)
-
-    @staticmethod
-    def _plus_identity(S):
-        return cholesky(add(S, jnp.ones((), S.dtype)))
-
-    # A property and no field: it depends on λ, which may differ from step to step, and a plan is
-    # made for all steps.
-    @property
-    def _end_root(self):
-        """N."""
-        assert self.errors.gram is not None
-        return self._plus_identity(self.end_scale * self.errors.gram)
+            self.end = _Positive.plus_identity(end_scale * errors.gram)
+            across = errors.factor.T @ self.factor
+            self.gram = _schur(self.gram, end_scale, across, self.end)
+        self.whole = _Positive.plus_identity(scale * self.gram)
 
     def pull(self, r: State) -> Noise:
         """(I + κ C)⁻¹ f."""
-        r = solve_lower(self.errors.sd, r)
-        f = apply(transpose(self.factor), r)
-        if self.across is not None:
-            # f = Gᵀ D⁻¹ r − λ (N⁻¹ Fᵀ D⁻¹ G)ᵀ N⁻¹ Fᵀ D⁻¹ r
-            assert self.errors.factor is not None
-            back = solve_lower(self._end_root, apply(transpose(self.errors.factor), r))
-            f = f - self.end_scale * apply(transpose(self.across), back)
-        return solve_lower(self.root, solve_lower(self.root, f), transposed=True)
+        f = apply(transpose(self.factor), self._without_end(solve_lower(self.errors.sd, r)))
+        return self.whole.solve(f)
+
+    def _without_end(self, x: State) -> State:
+        """E⁻¹ x in units of the errors, (1 − λ F N⁻ᵀ N⁻¹ Fᵀ) x."""
+        if self.end is None:
+            return x
+        F = self.errors.factor
+        assert F is not None
+        return x - self.end_scale * apply(F, self.end.solve(apply(transpose(F), x)))
 
     def information(self) -> Float[Array, "k k"]:
         """H."""
-        H = solve_lower(self.root, solve_lower(self.root, self.gram), transposed=True)
+        H = self.whole.solve(self.gram)
         # It is symmetric but for rounding, and is factorised.
         return 0.5 * (H + H.T)
 
     def solve(self, r: State) -> State:
         """(E + κ G Gᵀ)⁻¹ r."""
+        return self.solved(self.scale, self.pull, r)
+
+    def solved(self, scale: Array, pull: Callable[[State], Noise], r: State) -> State:
+        """(E + c G Gᵀ)⁻¹ r for c = `scale`, `pull` giving (I + c C)⁻¹ f, with the derivative of a
+        solution.
+        """
         sd = self.errors.sd
-        F = self.errors.factor
-        # Woodbury once more: E⁻¹ (r − κ G (I + κ C)⁻¹ f).
-        left = solve_lower(sd, r) - self.scale * apply(self.factor, self.pull(r))
-        if F is not None:
-            # E⁻¹ in units of the errors, 1 − λ F N⁻ᵀ N⁻¹ Fᵀ
-            N = self._end_root
-            back = solve_lower(N, solve_lower(N, apply(transpose(F), left)), transposed=True)
-            left = left - self.end_scale * apply(F, back)
-        return solve_lower(sd, left)
+
+        def times(x):
+            x = apply(sd, x)
+            moved = x + scale * apply(self.factor, apply(transpose(self.factor), x))
+            if self.errors.factor is not None:
+                F = self.errors.factor
+                moved = moved + self.end_scale * apply(F, apply(transpose(F), x))
+            return apply(sd, moved)
+
+        def by_factors(_, r):
+            # Woodbury once more: E⁻¹ (r − c G (I + c C)⁻¹ f).
+            left = solve_lower(sd, r) - scale * apply(self.factor, pull(r))
+            return solve_lower(sd, self._without_end(left))
+
+        return lax.custom_linear_solve(times, r, by_factors, symmetric=True)
 
     def dense(self) -> Structured:
         """E + κ G Gᵀ."""
@@ -149,26 +189,42 @@ class NoiseSteering(AbstractSteering):
     r: State
     factor: Float[Array, "k k"]
     """Q, with Q Qᵀ = Π."""
-    pull: Noise
-    """Q⁻¹ s (I + κ C)⁻¹ f."""
 
     def __init__(self, covariance: LowRank, step, r: State):
         self.covariance = covariance
         self.step = step
         self.r = r
         self.factor = cholesky(add(step**2 * covariance.information(), jnp.ones((), r.dtype)))
-        self.pull = solve_lower(self.factor, step * covariance.pull(r))
+
+    def solve(self, r: State) -> State:
+        """(E + (κ + s²) G Gᵀ)⁻¹ r."""
+        # I + (κ + s²) C = (I + κ C) Π
+        covariance = self.covariance
+
+        def pull(r):
+            half = solve_lower(self.factor, covariance.pull(r))
+            return solve_lower(self.factor, half, transposed=True)
+
+        return covariance.solved(covariance.scale + self.step**2, pull, r)
+
+    def moved(self, change: State) -> "NoiseSteering":
+        """The same, of what is observed moved."""
+        return eqx.tree_at(lambda steering: steering.r, self, self.r + change)
+
+    def _pull(self) -> Noise:
+        """Q⁻¹ s (I + κ C)⁻¹ f."""
+        return solve_lower(self.factor, self.step * self.covariance.pull(self.r))
 
     def mean(self):
-        return solve_lower(self.factor, self.pull, transposed=True)
+        return solve_lower(self.factor, self._pull(), transposed=True)
 
     def drive(self, z):
-        u = solve_lower(self.factor, self.pull + z, transposed=True)
+        u = solve_lower(self.factor, self._pull() + z, transposed=True)
         # B = Q⁻ᵀ, so log|B| = −log|Q| for each column.
         return u, log_ratio(z, u) - columns(z) * log_diagonal(self.factor, len(u))
 
     def inverse(self, u):
-        return apply(transpose(self.factor), u) - self.pull
+        return apply(transpose(self.factor), u) - self._pull()
 
     def log_evidence(self) -> Float[Array, ""]:
         """log density of v given the present state, on the last step, where nothing but independent

@@ -15,17 +15,18 @@ nodes of trees, is seen at a later time: there the path ends.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from .._checks import as_float, require
-from .._linalg import apply, cholesky, filled, solve_lower, transpose, without_variance
+from .._linalg import apply, compose, filled, solve_positive, transpose, without_variance
 from .._types import State, Structured
 from ..sdes import AbstractSDE, SemilinearSDE
 from ._few_noises import LowRank
-from ._guides import AbstractGuide, AbstractPlan, FrozenGuide, RecedingGuide, RecedingPlan, per_time
+from ._guides import AbstractGuide, AbstractPlan, FrozenGuide, RecedingGuide, RecedingPlan
 
 
 class GeodesicGuide(AbstractGuide):
@@ -67,53 +68,56 @@ class GeodesicGuide(AbstractGuide):
         receding = self.receding.plan(sde, seen, reference, ts, beyond)
         if not isinstance(receding, RecedingPlan):
             return receding  # where a is constant a straight line is the geodesic
-        here = (receding.steps, ts[:-1], ts[-1] + beyond - ts[:-1])
-        # A step is corrected by the geodesic from its start, so an entry has that of the time
-        # before beside its own; the first one, at t0, ends no step.
-        before = jax.tree.map(lambda a: jnp.concatenate([a[:1], a[:-1]]), here)
-        return _GeodesicPlan((here, before), receding, sde, self.correction)
+        steps = (receding.steps, ts[:-1], ts[-1] + beyond - ts[:-1])
+        return _GeodesicPlan(steps, receding, sde, self.correction)
 
 
 class _GeodesicPlan(AbstractPlan):
     steps: Any
-    """The receding plan's entry, the time, and the time left at the step's end and at its start"""
+    """The receding plan's entry, the time, and the time left"""
     receding: RecedingPlan
     sde: AbstractSDE
     correction_part: Structured
 
     def steer(self, step, transition, dt, x, observed):
-        here, before = step
-        miss, _ = self._miss(before, per_time(transition, dt), x, observed)
-        moved = observed + self.correction_part * miss
-        return self.receding.steer(here[0], transition, dt, x, moved)
+        entry, t, left = step
+        steering = self.receding.steer(entry, transition, dt, x, observed)
+        # The geodesic starts where the step does. Its momentum is that of the steering, whose
+        # factors then serve both.
+        start = (entry[0], t - dt, left + dt)
+        miss = self._miss(start, steering.r, steering.solve, x, observed)
+        return steering.moved(self.correction_part * miss)
 
     def message(self, step, sde, t, x, observed):
         # The uncorrected one: its value is a density of the datum, as that of a moved one is not.
-        return self.receding.message(step[0][0], sde, t, x, observed)
+        return self.receding.message(step[0], sde, t, x, observed)
 
     def correction(self, step, x):
-        here, _ = step
-        noise = self.sde.noise(here[1], x)
-        operator, shift, _ = self.receding.forecast(here[0], noise)
+        entry, t, left = step
+        operator, shift, covariance = self.receding.forecast(entry, self.sde.noise(t, x))
+        solve = _solver(covariance)
         # In displacements what is observed is 0.
-        miss, solve = self._miss(here, noise, x, jnp.zeros_like(shift))
+        r = -shift - apply(operator, x)
+        miss = self._miss((entry[0], t, left), r, solve, x, jnp.zeros_like(shift))
         # A target that is moved by δ moves the score by Lᵀ S⁻¹ δ.
         return apply(transpose(operator), solve(self.correction_part * miss))
 
-    def _miss(self, entry, noise, x, observed):
-        """By how much the path of the receding momentum misses what is observed, and S⁻¹."""
-        step, t, left = entry
-        operator, shift, covariance = self.receding.forecast(step, noise)
-        solve = _solver(covariance)
+    def _miss(self, start, r: State, solve: Callable[[State], State], x: State, observed: State):
+        """By how much the path of the receding momentum misses what is observed.
+
+        r and S, of which `solve` is the inverse, are those of the receding forecast.
+        """
+        flow, t, left = start
         # λ = S⁻¹ r of the receding guide, and its momentum p = Λᵀ λ, the score
-        r = observed - shift - apply(operator, x)
         momentum = solve(r)
+        to_go = jnp.sum(r * momentum)
 
         def hamiltonian(x, p):
             return jnp.sum(p * self.sde.drift(t, x)) + self.sde.energy(t, x, p)
 
         slopes = jax.grad(hamiltonian, (0, 1))
-        p = apply(transpose(operator), momentum)
+        L = self.receding.seen.operator
+        p = apply(transpose(compose(L, flow)), momentum)
         # One midpoint step over all the time left: x' = ∂H/∂p, p' = −∂H/∂x. A guide need not be
         # exact, and what the step leaves out costs variance, no bias.
         dp, dx = slopes(x, p)
@@ -121,17 +125,15 @@ class _GeodesicPlan(AbstractPlan):
         x = x + left * dx
         p = p - left * dp
         # λ̂ with p̂ = Lᵀ λ̂, row by row; of a general L, whose rows p̂ may have left, λ is kept.
-        L = self.receding.seen.operator
         error = self.receding.seen.covariance
         if L.ndim < 2:
             momentum = apply(jnp.where(L == 0, 0.0, 1 / jnp.where(L == 0, 1.0, L)), p)
         miss = observed - apply(L, x) - apply(error, momentum)
         # Damped where it is longer than the way to go, both in the metric S⁻¹. At the target there
         # is no way to go: the double `where` keeps 0/0 out of the derivative.
-        to_go = jnp.sum(r * solve(r))
         ratio = jnp.sum(miss * solve(miss)) / jnp.where(to_go > 0, to_go, 1.0)
         excess = jnp.where(to_go > 0, ratio, 0.0)
-        return miss / (1 + (0.5 * excess) ** 2), solve
+        return miss / (1 + (0.5 * excess) ** 2)
 
 
 def _solver(covariance: Structured | LowRank) -> Callable[[State], State]:
@@ -139,8 +141,7 @@ def _solver(covariance: Structured | LowRank) -> Callable[[State], State]:
     if isinstance(covariance, LowRank):
         return covariance.solve
     # What has no variance is forecast exactly, or out of reach: any variance may stand for it.
-    factor = cholesky(filled(covariance, without_variance(covariance)))
-    return lambda r: solve_lower(factor, solve_lower(factor, r), transposed=True)
+    return partial(solve_positive, filled(covariance, without_variance(covariance)))
 
 
 def default_guide(sde: AbstractSDE, x: State) -> AbstractGuide:

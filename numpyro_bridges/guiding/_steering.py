@@ -34,6 +34,7 @@ from .._linalg import (
     filled,
     log_diagonal,
     solve_lower,
+    solve_positive,
     transpose,
     without_variance,
 )
@@ -107,6 +108,14 @@ class GaussianSteering(AbstractSteering):
             self.S = S
             self.M = covariance
         self.r = observed - shift - apply(operator, transition.mean)
+
+    def solve(self, r: State) -> State:
+        """S⁻¹ r."""
+        return solve_positive(self.S, r)
+
+    def moved(self, change: State) -> "GaussianSteering":
+        """The same, of what is observed moved."""
+        return eqx.tree_at(lambda steering: steering.r, self, self.r + change)
 
     def _factors(self) -> tuple[Structured, Structured, State]:
         """N, N + P and y."""

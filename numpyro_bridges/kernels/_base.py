@@ -109,9 +109,9 @@ class AbstractRadialKernel(AbstractKernel):
 
     def matrix(self, x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:
         # Of squares: √ has no slope where points coincide, and a smooth profile needs none.
-        distances = squared_distances(x, y)
-        amplitude, length_scale = self.scales(distances.dtype)
-        return amplitude * self.profile(distances / jnp.square(length_scale))
+        amplitude, length_scale = self.scales()
+        distances = squared_distances(x, y, length_scale)
+        return amplitude.astype(distances.dtype) * self.profile(distances)
 
     @property
     def variance(self) -> Float[Array, ""]:

@@ -61,14 +61,22 @@ def points(x: ArrayLike, name: str) -> Float[Array, "n dim"]:
     return x
 
 
-def squared_distances(x: Float[Array, "n dim"], y: Float[Array, "m dim"]) -> Float[Array, "n m"]:
-    """|x_i - y_j|² from differences: exactly 0 at coincident points, symmetric where x is y."""
+def squared_distances(
+    x: Float[Array, "n dim"], y: Float[Array, "m dim"], unit: Float[Array, ""]
+) -> Float[Array, "n m"]:
+    """|x_i - y_j|² in a unit of length, from differences: exactly 0 at coincident points, symmetric
+    where x is y.
+    """
     x = points(x, "x")
     y = points(y, "y")
     require(
         x.shape[1] == y.shape[1],
         f"`x` and `y` must hold points of one dimension; got shapes {x.shape} and {y.shape}.",
     )
+    # Points are scaled, not squares: n divisions in place of n m, and as few for the slope in the
+    # unit.
+    x = x / unit.astype(x.dtype)
+    y = y / unit.astype(y.dtype)
     # Not |x|² + |y|² − 2 x·y, whose cancellation may give near points a negative square.
     # One coordinate at a time: whole n × m arrays, and a derivative with none of shape (n, m, dim).
     return reduce(

@@ -31,7 +31,15 @@ from .._checks import (
     require_positive,
     words,
 )
-from .._linalg import add, cholesky, safe_sqrt, solve_lower, varying_like
+from .._linalg import (
+    add,
+    cholesky,
+    half_square,
+    safe_sqrt,
+    solve_lower,
+    solve_positive,
+    varying_like,
+)
 from ..kernels import AbstractKernel
 
 _LOST = 0.5
@@ -134,21 +142,23 @@ class LandmarkNoise(AbstractNoise):
         return self.factor_and_covariance(kernel, covariance, points)[0]
 
     def factor_and_covariance(self, kernel, covariance, points):
-        factor, none, K = self.factored(covariance, points)
-        return jnp.where(none, 0.0, factor), K
+        S, none, K = self.positive(covariance, points)
+        return jnp.where(none, 0.0, cholesky(S)), K
 
     def velocity(self, kernel, covariance, points, moves):
-        root, none, _ = self.factored(covariance, points)
-        weights = solve_lower(root, solve_lower(root, moves), transposed=True)
+        S, none, _ = self.positive(covariance, points)
+        weights = solve_positive(S, moves)
         return lambda others: jnp.where(none, 0.0, covariance.matrix(others, points) @ weights)
 
-    def factored(self, covariance, points) -> tuple[Array, Array, Array]:
-        """A factor that has an inverse, whether there is no noise at all, and the covariance."""
+    def positive(self, covariance, points) -> tuple[Array, Array, Array]:
+        """A covariance that has an inverse, whether there is no noise at all, and the covariance
+        itself.
+        """
         K = covariance.matrix(points, points)
         variance = covariance.variance.astype(K.dtype)
         K = add(K, self.own_jitter(K.dtype) * variance)
         none = variance == 0  # an amplitude that underflows
-        return cholesky(jnp.where(none, jnp.eye(len(K), dtype=K.dtype), K)), none, K
+        return jnp.where(none, jnp.eye(len(K), dtype=K.dtype), K), none, K
 
 
 class ControlNoise(AbstractNoise):
@@ -270,17 +280,17 @@ class ControlNoise(AbstractNoise):
         return jnp.where(missing < _LOST, sigma, jnp.nan)
 
     def _crossed(self, covariance, points) -> tuple[Array, Array, Array]:
-        """A factor of a(c, c), whether there is no noise at all, and a(c, x)."""
+        """a(c, c) with an inverse, whether there is no noise at all, and a(c, x)."""
         index = self.factored_at(points)
-        root, none, K = self.controls.factored(covariance, points[index])
+        S, none, K = self.controls.positive(covariance, points[index])
         # the controls move as landmarks do
         across = covariance.matrix(points[index], points).at[:, index].set(K)
-        return root, none, across
+        return S, none, across
 
     def _factor_and_missing(self, covariance, points) -> tuple[Array, Array]:
         """σ, and the part of a(x, x) that is missing at the worst point."""
-        root, none, across = self._crossed(covariance, points)
-        sigma = jnp.where(none, 0.0, solve_lower(root, across).T)
+        S, none, across = self._crossed(covariance, points)
+        sigma = jnp.where(none, 0.0, solve_lower(cholesky(S), across).T)
         # 1 where there is none
         variance = covariance.variance.astype(sigma.dtype) + none.astype(sigma.dtype)
         told = jnp.min(jnp.sum(sigma**2, axis=1)) / variance
@@ -288,8 +298,8 @@ class ControlNoise(AbstractNoise):
 
     def energy(self, covariance, points, p) -> Array:
         """½ Σ pᵀ σσᵀ p over columns, without σ."""
-        root, none, across = self._crossed(covariance, points)
-        return jnp.where(none, 0.0, 0.5 * jnp.sum(solve_lower(root, across @ p) ** 2))
+        S, none, across = self._crossed(covariance, points)
+        return jnp.where(none, 0.0, half_square(S, across @ p))
 
     def velocity(self, kernel, covariance, points, moves):
         index = self.factored_at(points)
