@@ -33,7 +33,7 @@ from .._linalg import (
 )
 from .._types import Noise, State, Structured
 from ..conditioning import whitened_log_density
-from ._steering import AbstractSteering, log_ratio
+from ._steering import AbstractConditionalSteering, log_ratio
 
 
 def are_few(sigma: Structured, num_values: int) -> bool:
@@ -177,7 +177,7 @@ class LowRank(eqx.Module):
         return congruence(self.errors.sd, add(S, jnp.ones((), S.dtype)))
 
 
-class NoiseSteering(AbstractSteering):
+class NoiseSteering(AbstractConditionalSteering):
     """The conditional law of u given v, where r, v less its forecast at the mean, is s G u + error.
 
     u = Q⁻ᵀ (Q⁻¹ s (I + κ C)⁻¹ f + z): both parts of N(Π⁻¹ s (I + κ C)⁻¹ f, Π⁻¹) by one solve.
@@ -196,8 +196,7 @@ class NoiseSteering(AbstractSteering):
         self.r = r
         self.factor = cholesky(add(step**2 * covariance.information(), jnp.ones((), r.dtype)))
 
-    def solve(self, r: State) -> State:
-        """(E + (κ + s²) G Gᵀ)⁻¹ r."""
+    def solve(self, r):
         # I + (κ + s²) C = (I + κ C) Π
         covariance = self.covariance
 
@@ -206,10 +205,6 @@ class NoiseSteering(AbstractSteering):
             return solve_lower(self.factor, half, transposed=True)
 
         return covariance.solved(covariance.scale + self.step**2, pull, r)
-
-    def moved(self, change: State) -> "NoiseSteering":
-        """The same, of what is observed moved."""
-        return eqx.tree_at(lambda steering: steering.r, self, self.r + change)
 
     def _pull(self) -> Noise:
         """Q⁻¹ s (I + κ C)⁻¹ f."""

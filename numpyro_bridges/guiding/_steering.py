@@ -18,6 +18,7 @@ on the noises that the observation leaves free.
 """
 
 import abc
+from typing import Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -60,12 +61,28 @@ class AbstractSteering(eqx.Module):
         """The z that gives u; 0 for what of it an exact observation leaves without effect."""
 
 
+class AbstractConditionalSteering(AbstractSteering):
+    """The law of u given what is observed, whose distance from its forecast at the mean is r with
+    covariance S.
+    """
+
+    r: eqx.AbstractVar[State]
+
+    @abc.abstractmethod
+    def solve(self, r: State) -> State:
+        """S⁻¹ r."""
+
+    def moved(self, change: State) -> Self:
+        """The same, of what is observed moved."""
+        return eqx.tree_at(lambda steering: steering.r, self, self.r + change)
+
+
 def log_ratio(z: Noise, u: Noise) -> Float[Array, ""]:
     """log N(u; 0, I) − log N(z; 0, I)."""
     return 0.5 * (jnp.sum(z * z) - jnp.sum(u * u))
 
 
-class GaussianSteering(AbstractSteering):
+class GaussianSteering(AbstractConditionalSteering):
     """The conditional law of the noise given v ~ N(operator x' + shift, covariance); covariance
     None is exact.
 
@@ -109,13 +126,8 @@ class GaussianSteering(AbstractSteering):
             self.M = covariance
         self.r = observed - shift - apply(operator, transition.mean)
 
-    def solve(self, r: State) -> State:
-        """S⁻¹ r."""
+    def solve(self, r):
         return solve_positive(self.S, r)
-
-    def moved(self, change: State) -> "GaussianSteering":
-        """The same, of what is observed moved."""
-        return eqx.tree_at(lambda steering: steering.r, self, self.r + change)
 
     def _factors(self) -> tuple[Structured, Structured, State]:
         """N, N + P and y."""
