@@ -160,7 +160,9 @@ def test_stays_in_the_joint_law(name):
         state = kernel.init(key_chain, 0, start, (v,), {})
         if hasattr(state, "particles"):
             fresh = jr.normal(key_particles, state.particles["v_noise"][1:].shape)
-            state = state._replace(particles={"v_noise": jnp.concatenate([noise[None], fresh])})
+            # of the particles, the one that made the path is the one that was picked
+            particles = {"v_noise": jnp.concatenate([noise[None], fresh])}
+            state = state._replace(particles=particles, z=state.z | {"v_noise": noise})
             state = kernel.refresh(state, (v,), {})
         state, _ = jax.lax.scan(
             lambda state, _: (kernel.sample(state, (v,), {}), None), state, length=steps

@@ -51,19 +51,19 @@ def laplace(potential, theta: Array, *others, visit=None):
     """
     # the Hessian as BFGS has it: differentiation would compile derivatives of the gradient
     value_and_grad = jax.value_and_grad(potential, tuple(range(1 + len(others))))
-
     start = Reference(theta, jnp.eye(theta.size, dtype=theta.dtype))
 
+    # a model of noise alone
+    if not theta.size:
+        if visit is None:
+            return start, None
+        return start, jax.lax.map(lambda point: value_and_grad(*point), visit(start))
+
     def found_by(search: _Search) -> Reference:
-        # a model of noise alone
-        if not theta.size:
-            return start
         mode = jnp.where(jnp.isfinite(search.value), search.x, jnp.nan)
         return if_finite(Reference(mode, jnp.linalg.cholesky(search.inverse)), start)
 
     num_visits = 0 if visit is None else len(visit(start)[0])
-    if not theta.size and not num_visits:
-        return start, None
 
     def go_on(carry):
         search, i, _ = carry
@@ -121,8 +121,6 @@ def _start_search(x: Array) -> _Search:
 
 
 def _goes_on(search: _Search) -> Array:
-    if not search.x.size:
-        return jnp.array(False)
     # a step that promises less than rounding would fill the inverse Hessian with noise
     rounding = _ROUNDING * jnp.finfo(search.x.dtype).eps
     promised = -search.slope @ search.step
