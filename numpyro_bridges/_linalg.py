@@ -193,6 +193,7 @@ def half_square(S: Array, x: Array) -> Array:
 
 
 @half_square.defjvp
+@full_precision
 def _(primals, tangents):
     S, x = primals
     dS, dx = tangents

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+import numpyro_bridges as nb
 from numpyro_bridges._linalg import half_square, solve_positive
 from numpyro_bridges.guiding._drive import drive
 from numpyro_bridges.guiding._few_noises import Errors, LowRank, NoiseSteering
@@ -108,3 +109,21 @@ def test_derivatives_of_solutions(key, name):
     found, expected = jax.jit(lambda: (derivatives(f), derivatives(g)))()
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("noise", [nb.LandmarkNoise(), nb.ControlNoise(4)], ids=["all", "few"])
+def test_every_product_keeps_its_digits(noise):
+    """A GPU's default would round them; the rules above are traced apart from what they belong to."""
+    x0 = np.stack([np.cos(np.arange(12.0)), np.sin(np.arange(12.0))], 1)
+
+    def log_weight(amplitude, length_scale, z):
+        kernel = nb.GaussianKernel(amplitude, length_scale)
+        flow = nb.KunitaFlow(nb.Landmarks(12, 2), kernel, noise=noise)
+        match = nb.InexactMatch(0.003).at(1.1 * x0)
+        return nb.GuidedBridge(flow, match, x0=x0, t1=1.0, num_steps=3).log_weight(z)
+
+    size = 12 if isinstance(noise, nb.LandmarkNoise) else 4
+    gradient = jax.jit(jax.grad(log_weight, (0, 1, 2)))
+    program = gradient.lower(0.3, 0.9, jnp.zeros((3, size, 2))).as_text()
+    products = [line for line in program.splitlines() if "dot_general" in line]
+    assert products and all("precision = [HIGHEST, HIGHEST]" in line for line in products)

@@ -26,6 +26,7 @@ from .._linalg import (
     cholesky,
     columns,
     congruence,
+    full_precision,
     log_diagonal,
     solve_lower,
     solve_positive,
@@ -68,6 +69,7 @@ def _schur(A: Array, scale: Array, B: Array, T: "_Positive") -> Array:
 
 
 @_schur.defjvp
+@full_precision
 def _(primals, tangents):
     _, scale, B, T = primals
     dA, dscale, dB, dT = tangents
